@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from mereo.api.words import python_words
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
 
     from mereo_viewer.server import OpenPage
 
-Pose = Float[np.ndarray, "4 4"]
+Pose = Float[ndarray, "4 4"]
 
 
 Entry = TypeVar("Entry")
@@ -279,7 +280,7 @@ class Result(Answer, SegmentedResult):
         return None if self.registered is None else self.registered.pose()
 
     @cached_property
-    def covariance(self) -> Float[np.ndarray, "6 6"] | None:
+    def covariance(self) -> Float[ndarray, "6 6"] | None:
         """Covariance of ``pose``: a turn in radians, then a shift in the frame's unit; None without a fit.
 
         Both in the frame's axes: the true pose is ``[exp(turn) R, p + shift]`` where ``pose`` is ``[R, p]``; p is where
@@ -587,7 +588,7 @@ def _segment_results(
 
 
 def _numbers(values: Any) -> Any:
-    return None if values is None else np.array(values, dtype=np.float64)
+    return None if values is None else np.array(values, dtype=float)
 
 
 def _fact(*keys: str, read: Callable[[Any], Any] = lambda value: value) -> Any:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from numpy.linalg import inv
+
 from mereo.cli.options import Outcome
 from mereo.io.atomic_files import JsonObject
 
@@ -78,8 +80,6 @@ class Demo:
 
 def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, TruthGrid]]":
     """Name, title, object, frame and truth of each input; the first one's frame and meshes are written."""
-    import numpy as np
-
     from mereo.api.objects import load_object
     from mereo.api.reconstruct import load_frame
     from mereo.geometry.camera import into_camera
@@ -94,8 +94,8 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
 
     model = statistical_model_in("bunny")
     assert model.source_frame is not None
-    rest = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source))  # as in its files, metres
-    frame, truth = load_frame(SHIPPED_SCAN), truth_grid(rest.transformed(np.linalg.inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
+    rest = model.rest.transformed(inv(model.source_frame.T_scene_source))  # as in its files, metres
+    frame, truth = load_frame(SHIPPED_SCAN), truth_grid(rest.transformed(inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
     with new_directory(output / FRAME.parent, force=True) as folder:
         points = frame.cloud.points
         seen = transform_points(into_camera(points, frame.axes), points)

@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.linalg import eigh
 from numpy.random import Generator, default_rng
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
@@ -37,10 +39,10 @@ from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import Flags, Values
 from mereo.io.progress import stage
 
-Modes = Float[np.ndarray, "n 3 k"]
+Modes = Float[ndarray, "n 3 k"]
 """Motion of each node in each mode."""
 
-PerMode = Float[np.ndarray, " k"]
+PerMode = Float[ndarray, " k"]
 """A number for each mode."""
 
 _CORNERS = read_only(np.argwhere(np.ones((2, 2, 2))))
@@ -90,8 +92,8 @@ class ElasticSolid:
     """
 
     mesh: Tetrahedra
-    filled: Float[np.ndarray, " m"]
-    stiffness: Float[np.ndarray, " m"] | None = None
+    filled: Float[ndarray, " m"]
+    stiffness: Float[ndarray, " m"] | None = None
 
     def __post_init__(self) -> None:
         if not ((self.filled > 0) & (self.filled <= 1)).all():
@@ -99,7 +101,7 @@ class ElasticSolid:
         object.__setattr__(self, "filled", read_only_view(self.filled))
 
     @property
-    def volumes(self) -> Float[np.ndarray, " m"]:
+    def volumes(self) -> Float[ndarray, " m"]:
         """Filled volume of each tetrahedron."""
         return np.abs(self.mesh.volumes) * self.filled
 
@@ -267,7 +269,7 @@ class StateMap:
         """Map of one state, normal coefficients of variance 1 giving the prior's; the centre of mass stays."""
         linear = self.mesh.gradients(self.mesh.nodes + self.modes @ coefficients)
         mirrored = np.swapaxes(linear, 1, 2)
-        stretch, axes = np.linalg.eigh((linear + mirrored) / 2)
+        stretch, axes = eigh((linear + mirrored) / 2)
         strain = axes * np.exp(stretch - 1)[:, None] @ np.swapaxes(axes, 1, 2)
         spin = (linear - mirrored) / 2
         turn = Rotation.from_rotvec(np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)).as_matrix()

@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 
@@ -214,7 +215,7 @@ class RandomMotion:
         shares = dict[str, float]()
         for number, (sampler, members) in enumerate(self.steps, start=1):
 
-            def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
+            def surface(members: tuple[int, ...] = members) -> tuple[ndarray, ndarray]:
                 return _surface(self.rest, chains, members)
 
             if isinstance(sampler, JointSampler) and sampler.name:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 from scipy.interpolate import CubicSpline
@@ -134,9 +135,9 @@ class SmoothField:
     Amplitudes a are lengths, frequencies b radians per length, phases c radians.
     """
 
-    amplitudes: Float[np.ndarray, "k 3"]
-    frequencies: Float[np.ndarray, "k 3"]
-    phases: Float[np.ndarray, " k"]
+    amplitudes: Float[ndarray, "k 3"]
+    frequencies: Float[ndarray, "k 3"]
+    phases: Float[ndarray, " k"]
 
     def __post_init__(self) -> None:
         if not self.gradient_bound < 1:
@@ -177,7 +178,7 @@ class FreeFormLattice:
 
     origin: Vector
     spacing: Vector
-    displacements: Float[np.ndarray, "a b c 3"]
+    displacements: Float[ndarray, "a b c 3"]
 
     def __post_init__(self) -> None:
         share = float(np.abs(self.displacements / self.spacing).max())
@@ -222,8 +223,8 @@ class CurveSweep:
     @classmethod
     def through(
         cls,
-        nodes: Float[np.ndarray, " m"],
-        centers: Float[np.ndarray, "m 3"],
+        nodes: Float[ndarray, " m"],
+        centers: Float[ndarray, "m 3"],
         normal: Vector,
         radius: float,
     ) -> "CurveSweep":
@@ -253,7 +254,7 @@ class CurveSweep:
         return moved
 
 
-def transport_frames(tangents: Float[np.ndarray, "m 3"], normal: Vector) -> Float[np.ndarray, "m 3 3"]:
+def transport_frames(tangents: Float[ndarray, "m 3"], normal: Vector) -> Float[ndarray, "m 3 3"]:
     """Frames along a curve, rows tangent, normal, binormal, by parallel transport.
 
     From one tangent to the next the frame turns by the smallest rotation, so it never twists about the curve (Bergou

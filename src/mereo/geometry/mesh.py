@@ -8,7 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+from numpy.linalg import norm
+from numpy.random import default_rng
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
@@ -18,26 +21,33 @@ from mereo.geometry.transforms import (
     AnyPoints,
     Corners,
     Indices,
+    Matrices,
     Points,
     Transform,
     transform_points,
     unit_rows,
 )
 
-Vertices = Float[np.ndarray, "v 3"]
+Vertices = Float[ndarray, "v 3"]
 """Positions or vectors in rows: one for each vertex of a mesh."""
 
-Faces = Int[np.ndarray, "f 3"]
+Faces = Int[ndarray, "f 3"]
 """Three indices of vertices in each row, counter-clockwise seen from outside."""
 
-AnyFaces = Int[np.ndarray, "_ 3"]
+AnyFaces = Int[ndarray, "_ 3"]
 """The same, as many as there are: of a mesh that is changed, with ``AnyPoints``."""
 
-Elements = Int[np.ndarray, "m 4"]
+ChangedMesh = tuple[Float[ndarray, "w 3"], Int[ndarray, "g 3"]]
+"""Vertices and faces of a mesh that comes of another one, in numbers of their own."""
+
+Elements = Int[ndarray, "m 4"]
 """Four indices of nodes in each row, a tetrahedron."""
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
+
+Colors = UInt8[ndarray, "n 3"]
+"""A colour for each row of the axis ``n``."""
 
 PALETTE: tuple[Color, ...] = (
     (86, 180, 233),
@@ -172,7 +182,7 @@ class SegmentedMesh:
         return tuple(index not in hiding for index in range(len(self.segments)))
 
     @property
-    def owned_volumes(self) -> Float[np.ndarray, " s"]:
+    def owned_volumes(self) -> Float[ndarray, " s"]:
         """Volume that belongs to each segment: its mesh's without that of the segments nested in it."""
         volumes = np.array([segment.volume for segment in self.segments])
         for outer in (i for i, s in enumerate(self.segments) if len(s.faces)):  # the inner ones come first and are done
@@ -188,7 +198,7 @@ class SegmentedMesh:
         """Mesh with all vertices mapped by a homogeneous transform."""
         return self.with_vertices([transform_points(transform, segment.vertices) for segment in self.segments])
 
-    def merged(self) -> tuple[Vertices, Faces, Int[np.ndarray, " f"]]:
+    def merged(self) -> tuple[Vertices, Faces, Int[ndarray, " f"]]:
         """All segments in one array: vertices, faces, and for each face the index of its segment."""
         offsets = np.cumsum([0] + [len(s.vertices) for s in self.segments])
         vertices = np.concatenate([s.vertices for s in self.segments])
@@ -229,14 +239,14 @@ def check_segment(segment: Segment) -> None:
         raise ValueError(f"segment {segment.name!r} has {fault}")
 
 
-def directed_edges(faces: AnyFaces) -> Int[np.ndarray, "_ 2"]:
+def directed_edges(faces: AnyFaces) -> Int[ndarray, "_ 2"]:
     """The three edges of each face in turn, from corner to corner."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
 
 
 def edge_uses(
     faces: Faces,
-) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
+) -> tuple[Int[ndarray, "e 2"], Int[ndarray, " e"], Bool[ndarray, " e"]]:
     """Edges with their lower end first, how many faces each has, and whether these do not go there and back alike."""
     directed = directed_edges(faces)
     size = int(directed.max(initial=0)) + 1
@@ -252,14 +262,14 @@ def edge_imbalance(faces: Faces) -> tuple[int, int]:
     return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
 
 
-def three_cornered(faces: Faces) -> Bool[np.ndarray, " f"]:
+def three_cornered(faces: Faces) -> Bool[ndarray, " f"]:
     """Which faces have three different vertices."""
     return np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
 
 
 def with_used_vertices(
-    vertices: Vertices, faces: Int[np.ndarray, "f k"]
-) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f k"]]:
+    vertices: Vertices, faces: Int[ndarray, "f k"]
+) -> tuple[Float[ndarray, "w 3"], Int[ndarray, "f k"]]:
     """Mesh without the vertices that no face has; the others stay in their order."""
     used, kept = np.unique(faces, return_inverse=True)  # flat before numpy 2
     return vertices[used], kept.reshape(faces.shape)
@@ -270,13 +280,13 @@ def palette_color(index: int) -> Color:
     return PALETTE[index % len(PALETTE)]
 
 
-def area_vectors(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "f 3"]:
+def area_vectors(vertices: Vertices, faces: Faces) -> Float[ndarray, "f 3"]:
     """Normals of faces, each as long as twice the face's area."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     return np.cross(b - a, c - a)
 
 
-def connected(pairs: Int[np.ndarray, "p 2"], count: int) -> Indices:
+def connected(pairs: Int[ndarray, "p 2"], count: int) -> Indices:
     """Number of the group of each of ``count`` things, of which pairs hang together."""
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)
@@ -288,9 +298,9 @@ def surface_points(vertices: Vertices, faces: Faces, count: int) -> tuple[Points
     Vertices are not: a CAD program's are where a surface is round, none where it is flat.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cumsum(np.linalg.norm(area_vectors(vertices, faces), axis=1))
+    area = np.cumsum(norm(area_vectors(vertices, faces), axis=1))
     face = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
-    u, v = np.random.default_rng(0).random((2, count, 1))
+    u, v = default_rng(0).random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return a[face] + u * (b - a)[face] + v * (c - a)[face], face
 
@@ -299,12 +309,12 @@ FEW_VERTICES = 2500
 """Vertices below which places on the faces stand for a surface: corners of few large triangles do not show it."""
 
 
-def with_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "v 6"]:
+def with_normals(vertices: Vertices, faces: Faces) -> Float[ndarray, "v 6"]:
     """Vertices and their normals, outward as the faces are wound; those of vertices that no face has are 0."""
     return np.hstack([vertices, vertex_normals(Segment("", PALETTE[0], vertices, faces))])
 
 
-def oriented_points(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "n 6"]:
+def oriented_points(vertices: Vertices, faces: Faces) -> Float[ndarray, "n 6"]:
     """Points that stand for a surface: all vertices, or where these are few, points on the faces; with normals."""
     if len(vertices) >= FEW_VERTICES:
         return with_normals(vertices, faces)
@@ -312,7 +322,7 @@ def oriented_points(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "n 6"
     return np.hstack([points, area_vectors(vertices, faces)[face]])
 
 
-def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Points) -> Float[np.ndarray, "n 3"]:
+def barycentric(triangles: Matrices, points: Points) -> Points:
     """Barycentric coordinates of points in the planes of their triangles."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     normal = np.cross(b - a, c - a)

@@ -9,8 +9,11 @@ import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from numpy.linalg import norm, svd
 
 from mereo.geometry.brief import counted
+from mereo.geometry.labels import VoxelMask
 from mereo.geometry.mesh import (
     AnyFaces,
     Segment,
@@ -78,7 +81,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
     if len(faces) == 0:
         return Health(hopeless=tuple(hopeless), mendable=False)
     corners = vertices[np.unique(faces)] if hopeless else vertices
-    extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+    extent = svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or not extent[2] > FLAT * extent[0]:  # in any direction: of float32, a plane is this rough
         return Health(hopeless=(*hopeless, "is flat, without any volume"), mendable=False)
     collapsed = ~three_cornered(faces)
@@ -114,7 +117,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
     return Health(tuple(dirty), tuple(hopeless), notes=notes)
 
 
-def _broken_data(vertices: AnyPoints, faces: AnyFaces) -> tuple[list[str], Bool[np.ndarray, " f"]]:
+def _broken_data(vertices: AnyPoints, faces: AnyFaces) -> tuple[list[str], Bool[ndarray, " f"]]:
     """Faults of the arrays, and which faces can be used all the same."""
     faults = []
     finite = np.isfinite(vertices).all(axis=1)
@@ -134,8 +137,8 @@ def _encloses_nothing(vertices: AnyPoints, faces: AnyFaces) -> bool:
     """Whether a closed mesh has hardly any volume: far less than the thinnest sheet or wire of its size."""
     middle = vertices[faces].mean(axis=(0, 1))
     volume = abs(Segment("", (0, 0, 0), vertices - middle, faces).volume)
-    area = np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()
-    return not volume > 1e-9 * area * float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
+    area = norm(area_vectors(vertices, faces), axis=1).sum()
+    return not volume > 1e-9 * area * float(norm(np.ptp(vertices[np.unique(faces)], axis=0)))
 
 
 def _wrong_edges(vertices: AnyPoints, faces: AnyFaces, unit: str) -> tuple[int, list[str]]:
@@ -186,15 +189,15 @@ def faces_astray(vertices: AnyPoints, faces: AnyFaces) -> bool:
 class _FrontWinding(NamedTuple):
     """Winding number before each face that has an area (``proper``), its share of the surface, and its middle."""
 
-    winding: Float[np.ndarray, " p"]
-    share: Float[np.ndarray, " p"]
-    middle: Float[np.ndarray, "p 3"]
-    proper: Bool[np.ndarray, " f"]
+    winding: Float[ndarray, " p"]
+    share: Float[ndarray, " p"]
+    middle: Float[ndarray, "p 3"]
+    proper: Bool[ndarray, " f"]
 
-    def share_where(self, chosen: Bool[np.ndarray, " p"]) -> float:
+    def share_where(self, chosen: Bool[ndarray, " p"]) -> float:
         return float(self.share[chosen].sum())
 
-    def place(self, chosen: Bool[np.ndarray, " p"], unit: str) -> str:
+    def place(self, chosen: Bool[ndarray, " p"], unit: str) -> str:
         """Place of the largest of some faces."""
         return near(self.middle[np.where(chosen, self.share, -1.0).argmax()], unit)
 
@@ -202,20 +205,20 @@ class _FrontWinding(NamedTuple):
 def _front_winding(vertices: AnyPoints, faces: AnyFaces) -> _FrontWinding:
     corners = vertices[np.unique(faces)]
     low, high = corners.min(axis=0), corners.max(axis=0)
-    vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(np.linalg.norm(high - low))
+    vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(norm(high - low))
     normal = area_vectors(vertices, faces)
-    area = np.linalg.norm(normal, axis=1)
+    area = norm(normal, axis=1)
     proper = area > 1e-12
     a, b, c = (vertices[faces[proper, k]] for k in range(3))
     middle = (a + b + c) / 3
     # a ten-thousandth of the box's diagonal before each face; libigl's winding number is in single precision
     front = middle + 1e-4 * normal[proper] / area[proper, None]
     winding = igl.fast_winding_number(vertices, faces.astype(np.int64), front)
-    middle = middle * float(np.linalg.norm(high - low)) + (low + high) / 2
+    middle = middle * float(norm(high - low)) + (low + high) / 2
     return _FrontWinding(winding, area[proper] / max(area.sum(), 1e-300), middle, proper)
 
 
-def pieces(faces: AnyFaces, vertices: int) -> Int[np.ndarray, " f"]:
+def pieces(faces: AnyFaces, vertices: int) -> Int[ndarray, " f"]:
     """Number of the piece of each face; a piece is connected over edges which exactly two of its faces share."""
     edges = np.sort(directed_edges(faces), axis=1) @ [vertices, 1]
     order = np.argsort(edges, kind="stable")
@@ -227,15 +230,15 @@ FRAGMENT = 0.02
 """Diagonal of a fragment's box at most, in those of the whole."""
 
 
-def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Bool[np.ndarray, " f"], str]:
+def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Bool[ndarray, " f"], str]:
     """Faces of pieces that are tiny compared with the whole, and a phrase with their number, share, size and place."""
     piece = pieces(faces, len(vertices))
     corners = vertices[faces]
     low, high = (np.full((piece.max() + 1, 3), end) for end in (np.inf, -np.inf))
     np.minimum.at(low, piece, corners.min(axis=1))
     np.maximum.at(high, piece, corners.max(axis=1))
-    size = np.linalg.norm(high - low, axis=1)
-    tiny = size < FRAGMENT * float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+    size = norm(high - low, axis=1)
+    tiny = size < FRAGMENT * float(norm(high.max(axis=0) - low.min(axis=0)))
     if not tiny.any() or tiny.all():
         return np.zeros(len(faces), bool), ""
     stray = tiny[piece]
@@ -243,7 +246,7 @@ def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Boo
     length = f"{np.ptp([low[largest], high[largest]], axis=0).max():.2g}{unit and f' {unit}'}"
     which = f"the largest {length} long" if tiny.sum() > 1 else f"{length} long"
     where = near((low[largest] + high[largest]) / 2, unit)
-    area = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    area = norm(area_vectors(vertices, faces), axis=1)
     share = f"{100 * area[stray].sum() / max(area.sum(), 1e-300):.2g} % of its surface"
     count = f"{counted(int(tiny.sum()), 'fragment')} ({counted(int(stray.sum()), 'face')}, {share})"
     return stray, f"{count}, {which}, {where}"
@@ -357,12 +360,12 @@ class _Body:
         except ValueError:
             return None
 
-    def held_by(self, segment: Segment) -> Bool[np.ndarray, "x y z"]:
+    def held_by(self, segment: Segment) -> VoxelMask:
         """Whether the centre of each cell lies in a segment."""
         return label_grid(SegmentedMesh((segment,)), *self.axes) > 0
 
     @cached_property
-    def filled(self) -> Bool[np.ndarray, "x y z"]:
+    def filled(self) -> VoxelMask:
         return self.held_by(self.segment)
 
     def share_in(self, other: "_Body") -> float:

@@ -12,6 +12,8 @@ import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Int
+from numpy import ndarray
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
@@ -39,7 +41,7 @@ from mereo.geometry.mesh_check import (
     solid_of,
 )
 from mereo.geometry.solids import search_tree
-from mereo.geometry.transforms import AnyPoints, Flags, Indices, Values, Vector, longest_side, unit_rows
+from mereo.geometry.transforms import AnyPoints, Flags, Indices, Subset, Values, Vector, longest_side, unit_rows
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
@@ -99,7 +101,7 @@ def _drop_unusable(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
 
 def _merge_near(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """Vertices of open edges that are nearly the same, where that closes edges."""
-    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    diagonal = float(norm(np.ptp(vertices, axis=0)))
     best, fewest, change = (vertices, faces), len(open_edges(vertices, faces)), ""
     for distance in (share * diagonal for share in MERGED_WITHIN):
         if fewest:
@@ -159,7 +161,7 @@ def _unite(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
         solid = solid_of(vertices, faces)
     except ValueError:
         return vertices, faces, ""
-    area = float(np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()) / 2
+    area = float(norm(area_vectors(vertices, faces), axis=1).sum()) / 2
     if solid.surface_area() < 0.99 * area:  # manifold3d leaves out what has no volume
         return vertices, faces, ""
     shells = solid.decompose()
@@ -229,7 +231,7 @@ class _Body:
         """Distance from the surface."""
         return np.sqrt(self._tree.squared_distance(self.vertices, self.faces, places)[0])
 
-    def inside_blocks(self, first: Int[np.ndarray, "b 3"], cell: float) -> Bool[np.ndarray, "b 64"]:
+    def inside_blocks(self, first: Int[ndarray, "b 3"], cell: float) -> Bool[ndarray, "b 64"]:
         """The same for 4 x 4 x 4 nodes from ``first`` on, in cells of a size: far blocks are all in or all out."""
         middle = (first + 1.5) * cell
         winding = igl.fast_winding_number(self.vertices, self.faces, middle)
@@ -254,7 +256,7 @@ class _Body:
         return self.inside(nodes[order[first]])[part]
 
     def samples(
-        self, faces: Int[np.ndarray, " m"], spacing: float, around: AnyPoints | None = None
+        self, faces: Subset, spacing: float, around: AnyPoints | None = None
     ) -> tuple[AnyPoints, AnyPoints, Indices]:
         """Corners of some faces and places about ``spacing`` apart, the normal there, and the face of each.
 
@@ -263,13 +265,13 @@ class _Body:
         chosen = self.faces[faces]
         corners = self.vertices[chosen]
         normal = area_vectors(self.vertices, chosen)
-        area = np.linalg.norm(normal, axis=1)
+        area = norm(normal, axis=1)
         normal /= np.maximum(area, 1e-300)[:, None]
         most = int(np.clip(area.sum() / 2 / spacing**2, 1000, MOST_SAMPLES))
         spread, face = surface_points(self.vertices, chosen, most)
         _, first = np.unique(chosen, return_index=True)
         edges = np.roll(corners, -1, axis=1) - corners  # along which a thin part has places, however small its area is
-        count = np.ceil(np.linalg.norm(edges, axis=2) / spacing).astype(int).ravel()
+        count = np.ceil(norm(edges, axis=2) / spacing).astype(int).ravel()
         row = np.repeat(np.arange(len(count)), np.where(count > 1, np.minimum(count, 1000), 0))
         share = (np.arange(len(row)) - np.searchsorted(row, row)) / np.minimum(count, 1000)[row]
         along = corners.reshape(-1, 3)[row] + share[:, None] * edges.reshape(-1, 3)[row]
@@ -345,7 +347,7 @@ def _without_specks(solid: manifold3d.Manifold, side: float) -> manifold3d.Manif
     return solid if len(kept) == len(shells) else manifold3d.Manifold.compose(kept)
 
 
-def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[np.ndarray, "b 3"]:
+def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[ndarray, "b 3"]:
     """Blocks of a lattice with a margin around places, those around the largest ``way`` first."""
     shifts = margin * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
     order = np.argsort(-way, kind="stable")
@@ -354,7 +356,7 @@ def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[n
     return blocks[np.argsort(first)]
 
 
-def _fine_surface(body: _Body, blocks: Int[np.ndarray, "b 3"], cell: float) -> manifold3d.Manifold:
+def _fine_surface(body: _Body, blocks: Int[ndarray, "b 3"], cell: float) -> manifold3d.Manifold:
     """Surface within blocks of 16 x 16 x 16 cells and one cell around; it is closed along their outside."""
     parts = (4 * blocks[:, None] + np.indices((5, 5, 5)).reshape(3, -1).T).reshape(-1, 3)
     first = 4 * np.unique(parts, axis=0) - 1
@@ -430,7 +432,7 @@ def farthest(before: Segment, after: Segment) -> tuple[Reach, Reach]:
     100,000 places between.
     """
     body, other = _Body(before.vertices, before.faces), _Body(after.vertices, after.faces)
-    length = float(np.linalg.norm(np.ptp(before.vertices, axis=0)))
+    length = float(norm(np.ptp(before.vertices, axis=0)))
     places, normals, _ = body.samples(np.arange(len(before.faces)), length / 300)
     way = other.distance(places)
     reach: dict[bool, Reach] = {}
@@ -490,7 +492,7 @@ def largest_piece(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, AnyF
     return with_used_vertices(vertices, faces[piece == np.bincount(piece).argmax()])
 
 
-def open_edges(vertices: AnyPoints, faces: AnyFaces) -> Int[np.ndarray, "_ 2"]:
+def open_edges(vertices: AnyPoints, faces: AnyFaces) -> Int[ndarray, "_ 2"]:
     """Directed edges that no face takes the other way, in the order of faces."""
     directed = directed_edges(faces)
     forth, back = directed @ [len(vertices), 1], directed @ [1, len(vertices)]

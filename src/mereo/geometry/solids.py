@@ -15,11 +15,12 @@ from typing import NamedTuple
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
 from scipy.sparse import csr_array
 
 from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_vectors
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Flags, Indices, Labels, Points, Values, Vector, unit_rows
+from mereo.geometry.transforms import Flags, Indices, Labels, Points, Subset, Values, Vector, unit_rows
 
 _DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]]))
 """Two generic directions: not along any axis, face diagonal or each other."""
@@ -39,7 +40,7 @@ class Hits(NamedTuple):
     distance: Values
     normal: Points
 
-    def nearer(self, rows: Int[np.ndarray, " m"], others: "Hits") -> Int[np.ndarray, " k"]:
+    def nearer(self, rows: Subset, others: "Hits") -> Int[ndarray, " k"]:
         """Rows of ``rows`` on which the ``others`` meet something nearer, which these hits take over, in place."""
         better = others.distance < self.distance[rows]
         kept = rows[better]
@@ -47,7 +48,7 @@ class Hits(NamedTuple):
         return kept
 
 
-def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m"]:
+def toward(directions: Points, low: Vector, high: Vector) -> Subset:
     """Rays that may hit the box from ``low`` to ``high``: all of them where it is not wholly in front of the camera.
 
     A segment covers a small part of an image, and a ray that misses costs as much as one that hits.
@@ -62,7 +63,7 @@ def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m
     return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
 
 
-def search_tree(vertices: Vertices, elements: Int[np.ndarray, "m k"]) -> igl.AABB:
+def search_tree(vertices: Vertices, elements: Int[ndarray, "m k"]) -> igl.AABB:
     """Tree in which libigl finds the nearest of triangles, or the tetrahedron around a point."""
     tree = igl.AABB()
     tree.init(vertices, elements)
@@ -71,7 +72,7 @@ def search_tree(vertices: Vertices, elements: Int[np.ndarray, "m k"]) -> igl.AAB
 
 def cast_rays(
     tree: igl.AABB, vertices: Vertices, faces: Faces, origins: Points, directions: Points
-) -> tuple[Indices, Values, Float[np.ndarray, "n 2"]]:
+) -> tuple[Indices, Values, Float[ndarray, "n 2"]]:
     """Find what each ray ``origin + t * direction`` meets first of the triangles of a tree.
 
     Returns the face, -1 where there is none, t, and the weights of the face's second and third corner; the latter two
@@ -93,7 +94,7 @@ class _Solid:
     """One closed segment with its search structures, built on first use."""
 
     def __init__(self, segment: Segment) -> None:
-        self.vertices = np.ascontiguousarray(segment.vertices, dtype=np.float64)
+        self.vertices = np.ascontiguousarray(segment.vertices, dtype=float)
         self.faces = np.ascontiguousarray(segment.faces, dtype=np.int64)
         self.is_solid = segment.solid
         self.low, self.high = segment.bounds
@@ -126,14 +127,14 @@ class _Solid:
             first[doubtful] = igl.fast_winding_number(self.vertices, self.faces, points[doubtful]) > 0.5
         return first
 
-    def _behind_first_hit(self, points: Points) -> Bool[np.ndarray, "2 n"]:
+    def _behind_first_hit(self, points: Points) -> Bool[ndarray, "2 n"]:
         """For each of two rays whether the first face it hits is seen from behind."""
         directions = np.repeat(_DIRECTIONS, len(points), axis=0)
         face = cast_rays(self.tree, self.vertices, self.faces, np.tile(points, (2, 1)), directions)[0]
         behind = np.einsum("ni,ni->n", self.normals[face], directions) > 0
         return (behind & (face >= 0)).reshape(2, -1)
 
-    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Subset, Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
         face, share, _ = cast_rays(self.tree, self.vertices, self.faces, np.zeros((len(rows), 3)), directions[rows])
@@ -178,10 +179,10 @@ class Solids:
         self._solids = [_Solid(segment) for segment in mesh.segments]
 
     @cached_property
-    def _merged(self) -> tuple[Vertices, Faces, Int[np.ndarray, " f"]]:
+    def _merged(self) -> tuple[Vertices, Faces, Int[ndarray, " f"]]:
         return self.mesh.merged()
 
-    def boxes(self) -> Float[np.ndarray, "s 2 3"]:
+    def boxes(self) -> Float[ndarray, "s 2 3"]:
         """Axis-aligned boxes of the segments."""
         return np.stack([[solid.low, solid.high] for solid in self._solids])
 
@@ -263,8 +264,8 @@ def signed_distance_and_direction(
 
 
 def label_grid(
-    mesh: SegmentedMesh, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
-) -> UInt8[np.ndarray, "nx ny nz"]:
+    mesh: SegmentedMesh, x: Float[ndarray, " nx"], y: Float[ndarray, " ny"], z: Float[ndarray, " nz"]
+) -> UInt8[ndarray, "nx ny nz"]:
     """Exact labels on the product grid of three ascending coordinate arrays; the first segment wins an overlap.
 
     Signed crossings are counted along columns instead of testing every node, see ``winding_number``: a closed segment
@@ -297,8 +298,8 @@ def label_grid(
 
 
 def winding_grid(
-    segment: Segment, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
-) -> Bool[np.ndarray, "nx ny nz"]:
+    segment: Segment, x: Float[ndarray, " nx"], y: Float[ndarray, " ny"], z: Float[ndarray, " nz"]
+) -> Bool[ndarray, "nx ny nz"]:
     """Whether each node of the product grid of three ascending coordinate arrays is inside a closed mesh."""
     corners = segment.vertices[segment.faces]
     triangle, i, j = _covered_columns(corners[..., :2], x, y)
@@ -315,11 +316,11 @@ def winding_grid(
 
 
 def _edge_sides(
-    corners: Float[np.ndarray, "p 3 2"],
-    ids: Int[np.ndarray, "p 3"],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, "p 3"]]:
+    corners: Float[ndarray, "p 3 2"],
+    ids: Int[ndarray, "p 3"],
+    x: Float[ndarray, " p"],
+    y: Float[ndarray, " p"],
+) -> tuple[Float[ndarray, "p 3"], Bool[ndarray, "p 3"]]:
     """Barycentric weights (not normalized) of columns in triangles, and whether each is left of the opposite edge.
 
     All triangles of an edge evaluate it from its lower vertex and so agree bit for bit. A column exactly on the edge
@@ -340,8 +341,8 @@ def _edge_sides(
 
 
 def _covered_columns(
-    corners: Float[np.ndarray, "f 3 2"], x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"]
-) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    corners: Float[ndarray, "f 3 2"], x: Float[ndarray, " nx"], y: Float[ndarray, " ny"]
+) -> tuple[Int[ndarray, " p"], Int[ndarray, " p"], Int[ndarray, " p"]]:
     """Pairs (triangle, column i, column j) whose column lies in the triangle's projected box."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     first_i, first_j = np.searchsorted(x, low[:, 0]), np.searchsorted(y, low[:, 1])
@@ -356,7 +357,7 @@ def _covered_columns(
 # --- moments ----------------------------------------------------------------------------------------------------------
 
 
-def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
+def owned_centroids(mesh: SegmentedMesh) -> Float[ndarray, "s 3"]:
     """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
     volumes, moments = mesh.owned_volumes, np.stack([_first_moment(segment) for segment in mesh.segments])
     for outer in range(len(moments)):  # the inner ones come first and are done
@@ -372,7 +373,7 @@ def _first_moment(segment: Segment) -> Vector:
     return np.asarray((volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle)
 
 
-def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
+def owned_gradients(mesh: SegmentedMesh) -> Float[ndarray, "s 4 v 3"]:
     """Derivatives of each segment's own volume, then of its centroid's x, y, z, by the vertices of all segments.
 
     The vertices are those of ``mesh.merged()``.
@@ -392,7 +393,7 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
     return result
 
 
-def _gradients(segment: Segment, origin: Vector) -> Float[np.ndarray, "4 v 3"]:
+def _gradients(segment: Segment, origin: Vector) -> Float[ndarray, "4 v 3"]:
     """Derivatives of a mesh's volume, and of its first moment about an origin, by its vertices."""
     corners = segment.vertices[segment.faces] - origin
     area = np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]) / 6.0  # of the volume, by each corner
@@ -404,5 +405,5 @@ def _gradients(segment: Segment, origin: Vector) -> Float[np.ndarray, "4 v 3"]:
     collect = csr_array(
         (np.ones(len(columns)), (segment.faces.ravel(), columns)), (len(segment.vertices), len(columns))
     )
-    gradients: np.ndarray = (collect @ each).reshape(-1, 4, 3)
+    gradients: ndarray = (collect @ each).reshape(-1, 4, 3)
     return gradients.transpose(1, 0, 2)

@@ -11,6 +11,9 @@ from functools import cached_property
 import igl
 import numpy as np
 from jaxtyping import Float, Int
+from numpy import ndarray
+from numpy.linalg import eigh, lstsq, norm
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.mesh import SegmentedMesh, area_vectors
@@ -98,7 +101,7 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
     if not alike.any():
         return _settled(surface, center, np.pi * axes)
     if alike.all():
-        turns = Rotation.random(600, rng=np.random.default_rng(0)).as_rotvec()
+        turns = Rotation.random(600, rng=default_rng(0)).as_rotvec()
         halves = [surface.settle(_about(center, np.pi * axis)) for axis in axes]
         middle = _fixed_point(halves)
         if np.mean([surface.is_kept(_about(middle, turn)) for turn in turns[:100]]) >= NEARLY:
@@ -141,14 +144,14 @@ class _Surface:
     tolerance: float
     points: Points
     normals: Points
-    visible: Int[np.ndarray, " v"]
+    visible: Int[ndarray, " v"]
 
     @classmethod
     def of(cls, mesh: SegmentedMesh, tolerance: float) -> "_Surface":
         vertices, faces, _ = mesh.merged()
         normals = area_vectors(vertices, faces)
-        area = np.linalg.norm(normals, axis=1)
-        rng, total = np.random.default_rng(0), np.cumsum(area)
+        area = norm(normals, axis=1)
+        rng, total = default_rng(0), np.cumsum(area)
         face = np.searchsorted(total, (np.arange(SAMPLES) + rng.random(SAMPLES)) * total[-1] / SAMPLES)
         face = np.minimum(face, len(faces) - 1)
         share = rng.dirichlet((1.0, 1.0, 1.0), SAMPLES)
@@ -159,11 +162,11 @@ class _Surface:
         return cls(mesh, tolerance, points, normals, np.flatnonzero(outside))
 
     @cached_property
-    def _tree(self) -> tuple[igl.AABB, np.ndarray, np.ndarray]:
+    def _tree(self) -> tuple[igl.AABB, ndarray, ndarray]:
         vertices, faces, _ = self.mesh.merged()
         return search_tree(vertices, faces), vertices, faces
 
-    def nearest(self, points: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    def nearest(self, points: Float[ndarray, "p 3"]) -> tuple[Float[ndarray, " p"], Float[ndarray, "p 3"]]:
         """Distance and place of the nearest point of all surfaces."""
         tree, vertices, faces = self._tree
         squared, _, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
@@ -173,7 +176,7 @@ class _Surface:
         """Centroid of the visible surface, its second moments, ascending, and their axes as rows."""
         seen = self.points[self.visible]
         center = seen.mean(axis=0)
-        values, vectors = np.linalg.eigh((seen - center).T @ (seen - center))
+        values, vectors = eigh((seen - center).T @ (seen - center))
         return center, values, vectors.T
 
     def off(self, turn: Transform) -> float:
@@ -181,8 +184,8 @@ class _Surface:
         return float(np.sqrt((self.nearest(transform_points(turn, self._few))[0] ** 2).mean()))
 
     @property
-    def _few(self) -> Float[np.ndarray, "f 3"]:
-        few: np.ndarray = self.points[self.visible[:: max(1, len(self.visible) // FEW)]]
+    def _few(self) -> Float[ndarray, "f 3"]:
+        few: ndarray = self.points[self.visible[:: max(1, len(self.visible) // FEW)]]
         return few
 
     def is_kept(self, turn: Transform) -> bool:
@@ -200,7 +203,7 @@ class _Surface:
             center = moved.mean(axis=0)
             rows = np.hstack([np.cross(moved - center, turned), turned])
             rows = np.vstack([rows, 1e-3 * np.sqrt(len(rows)) * np.eye(6)])
-            change = np.linalg.lstsq(rows, np.append((offset * turned).sum(axis=1), np.zeros(6)), rcond=None)[0]
+            change = lstsq(rows, np.append((offset * turned).sum(axis=1), np.zeros(6)), rcond=None)[0]
             turn = _about(center, change[:3], change[3:]) @ turn
         return turn
 
@@ -215,7 +218,7 @@ class _Surface:
         return tuple(result) if len(set(result)) == len(result) or None in result else (None,) * len(result)
 
 
-def _settled(surface: _Surface, center: Vector, turns: Float[np.ndarray, "t 3"]) -> tuple[Symmetry, ...]:
+def _settled(surface: _Surface, center: Vector, turns: Float[ndarray, "t 3"]) -> tuple[Symmetry, ...]:
     """Symmetries near to turns about a centre, each once."""
     starts = [_about(center, turn) for turn in turns]
     order = np.argsort([surface.off(start) for start in starts], kind="stable")[:60]
@@ -240,13 +243,13 @@ def _about(center: Vector, turn: Vector, shift: Vector | float = 0.0) -> Transfo
 def _axis_of(turn: Transform) -> Vector:
     """Axis of a turn, a unit vector."""
     vector = Rotation.from_matrix(turn[:3, :3]).as_rotvec()
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+    return vector / max(float(norm(vector)), 1e-12)
 
 
 def _fixed_point(turns: list[Transform]) -> Vector:
     """Find the point that turns move least; of those of one axis the nearest to the origin."""
     rows = np.concatenate([np.eye(3) - turn[:3, :3] for turn in turns])
-    point: np.ndarray = np.linalg.lstsq(rows, np.concatenate([turn[:3, 3] for turn in turns]), rcond=1e-6)[0]
+    point: ndarray = lstsq(rows, np.concatenate([turn[:3, 3] for turn in turns]), rcond=1e-6)[0]
     return point
 
 

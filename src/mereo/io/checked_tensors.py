@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -19,7 +20,7 @@ from mereo.io.object_storage import Place, StorageError
 
 HEADER, CHECKSUM = "mereo", "sha256"
 
-Tensors = Mapping[str, np.ndarray]
+Tensors = Mapping[str, ndarray]
 
 
 def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
@@ -40,7 +41,7 @@ def read_content(path: Place) -> bytes:
         raise ValueError(reason(error)) from None
 
 
-def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, np.ndarray], JsonObject]:
+def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, ndarray], JsonObject]:
     """Tensors that ``pack_tensors`` has packed, and their facts, none where there is no header entry.
 
     Raises ``ValueError`` (its reason only) where the content is damaged, or of another dataset than the one of this

@@ -15,6 +15,7 @@ from zlib import crc32
 
 import numpy as np
 import trimesh
+from numpy import ndarray
 from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
@@ -375,7 +376,7 @@ class _Shape(NamedTuple):
     content: trimesh.Trimesh | Path
     scale: Vector | None = None
 
-    def surfaces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def surfaces(self) -> Iterator[tuple[ndarray, ndarray]]:
         """Vertices and faces of its parts in its own frame."""
         if isinstance(self.content, Path):
             assert self.scale is not None
@@ -435,7 +436,7 @@ def _assembled(content: _Described) -> Robot:
     return Robot(SegmentedMesh(tuple(segments)), tuple(joined), tuple(sorted(notes)))
 
 
-def _check_numbers(path: Path, name: str, values: np.ndarray) -> None:
+def _check_numbers(path: Path, name: str, values: ndarray) -> None:
     if not (np.abs(values) <= LARGEST).all():
         raise ValueError(
             f"{path}: a pose, size or limit of {name!r} is NaN, infinite or beyond {LARGEST:g}: correct it"

@@ -127,9 +127,9 @@ class Model:
 
         Raises ``ValueError`` on unusable clouds.
         """
-        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
+        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=float))
         ordered, normalizer = self.normalized_cloud(cloud)
-        seen = ordered[0, : len(cloud)].numpy().astype(np.float64)
+        seen = ordered[0, : len(cloud)].numpy().astype(float)
         with self.answering():
             viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))
             code = self.inference.encode(ordered.to(self.device), viewpoint.to(self.device))
@@ -183,7 +183,7 @@ class Model:
             return self.class_logits(prediction, queries).softmax(dim=-1), prediction.rest
 
         probability, rest = self._chunked(code, points, answer)
-        return probability, rest.astype(np.float64)
+        return probability, rest.astype(float)
 
     def respond(
         self, prediction: Prediction, queries: QueryBatch
@@ -232,7 +232,7 @@ class Model:
         answer: Callable[[Prediction, Tensor], tuple[Tensor, ...]],
     ) -> list[np.ndarray]:
         """Parts of the answers at all points, computed chunk by chunk."""
-        normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
+        normalized = code.normalizer.apply(np.asarray(points, dtype=float)).astype(np.float32)
         size, most = (CUDA_QUERY_CHUNK, 1) if self.device.type == "cuda" else (CPU_QUERY_CHUNK, MOST)
         network = self.inference  # made by one thread, this one
 

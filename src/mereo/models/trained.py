@@ -131,7 +131,7 @@ def check_enough(count: int, message: str) -> None:
 
 def checked_points(cloud: PointCloud) -> Points:
     """Points of a cloud as float64, or ``ValueError`` with one sentence on why they cannot be used."""
-    points = np.asarray(cloud.points, dtype=np.float64)
+    points = np.asarray(cloud.points, dtype=float)
     check_enough(len(points), f"the cloud has {len(points)} points")
     if (points[:, 2] <= 0).any():
         raise ValueError(

@@ -13,6 +13,9 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.linalg import eigh, norm
+from numpy.random import Generator, default_rng
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -170,7 +173,7 @@ def _off_plane(points: Points, unit_m: float, frame: CloudAxes) -> Keep:
     middle = np.median(points[:, 2])
     if frame == "camera" and middle > 0:  # what lies behind the camera is refused later
         tolerance *= np.maximum(points[:, 2] / middle, 1.0) ** 2
-    plane = largest_plane(points, tolerance, np.random.default_rng(0))
+    plane = largest_plane(points, tolerance, default_rng(0))
     off = np.ones(len(points), dtype=bool) if plane is None else plane.distance(points) > tolerance
     share = 1.0 - off.mean()
     if plane is None or share < PLANE_SHARE:
@@ -260,7 +263,7 @@ class Plane:
         return np.abs(points @ self.normal - self.offset)
 
 
-def largest_plane(points: Points, tolerance: Values, rng: np.random.Generator) -> Plane | None:
+def largest_plane(points: Points, tolerance: Values, rng: Generator) -> Plane | None:
     """Plane with the most points within ``tolerance``; None where no three points span one.
 
     Args:
@@ -283,15 +286,15 @@ def largest_plane(points: Points, tolerance: Values, rng: np.random.Generator) -
         kept = points[plane.distance(points) <= tolerance]
         if len(kept) >= 3:
             center = kept.mean(axis=0)
-            normal = np.linalg.eigh(np.cov((kept - center).T))[1][:, 0]
+            normal = eigh(np.cov((kept - center).T))[1][:, 0]
             plane = Plane(normal, float(normal @ center))
     return plane
 
 
-def _through(triples: Float[np.ndarray, "t 3 3"]) -> tuple[Float[np.ndarray, "u 3"], Float[np.ndarray, " u"]]:
+def _through(triples: Float[ndarray, "t 3 3"]) -> tuple[Float[ndarray, "u 3"], Float[ndarray, " u"]]:
     """Planes through three points each; triples on a line are left out."""
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
+    lengths = norm(normals, axis=1)
     proper = lengths > 1e-12 * np.ptp(triples.reshape(-1, 3), axis=0).max() ** 2
     normals = normals[proper] / lengths[proper, None]
     return normals, np.einsum("ti,ti->t", normals, triples[proper, 0])
@@ -379,7 +382,7 @@ def readings(cloud: PointCloud | Points, axes: CloudAxes = "camera", keep_all: b
 
     Raises ``ValueError`` for points that are not finite.
     """
-    seen = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
+    seen = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=float))
     everything = Reading.of_all(seen)
     if keep_all or len(seen) < MIN_POINTS:
         return (everything,)
@@ -401,7 +404,7 @@ def nearer_layer(points: Points, patch: Indices) -> Flags:
     A mask that is too wide lets in what is behind the object, which may be as many points as the object's own where it
     is thin.
     """
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     parts = [distance[patch == number] for number in np.flatnonzero(np.bincount(patch) >= MIN_POINTS)]
     ends = np.array([np.quantile(part, (0.05, 0.95)) for part in sorted(parts, key=np.median)]).reshape(-1, 2)
     near = np.maximum.accumulate(ends[:-1, 1])

@@ -12,19 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
 
-from mereo.geometry.labels import LabelGrid, part_of_grid
+from mereo.geometry.labels import GridLabels, LabelGrid, VoxelMask, part_of_grid
 from mereo.geometry.marching_cubes import CellFlags, changing_cells, nodes_of, on_both_sides, over_corners, zero_surface
 from mereo.geometry.mesh import AnyFaces, Color, Segment, SegmentedMesh
-from mereo.geometry.transforms import AnyPoints, Corners, Points, Rows, Vector, longest_side
+from mereo.geometry.transforms import AnyPoints, Corners, Points, Rows, Subset, Vector, longest_side
 
-GridLabels = UInt8[np.ndarray, "x y z"]
-"""Label of each node of a grid."""
-
-GridRows = Int[np.ndarray, "x y z"]
+GridRows = Int[ndarray, "x y z"]
 """Row of the logits of each node."""
 
-Logits = Float[np.ndarray, "m c"]
+Logits = Float[ndarray, "m c"]
 """Logits in rows."""
 
 # --- coarse to fine ---------------------------------------------------------------------------------------------------
@@ -76,7 +74,7 @@ class _Evaluator:
         self.chunks: list[Logits] = []
         self.count = 0
 
-    def __call__(self, index: Int[np.ndarray, "m 3"]) -> tuple[UInt8[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    def __call__(self, index: Int[ndarray, "m 3"]) -> tuple[UInt8[ndarray, " m"], Subset]:
         """Labels and rows of nodes."""
         logits = self.field(self.origin + index * self.spacing)
         rows = np.arange(self.count, self.count + len(index), dtype=np.int32)
@@ -117,7 +115,7 @@ def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: 
     return Sampled(labels[inside], rows[inside], evaluate.logits())
 
 
-def _all_nodes(shape: tuple[int, int, int]) -> Int[np.ndarray, "n 3"]:
+def _all_nodes(shape: tuple[int, int, int]) -> Int[ndarray, "n 3"]:
     return np.indices(shape).reshape(3, -1).T
 
 
@@ -144,7 +142,7 @@ def _halve(
     active: CellFlags,
     step: int,
     evaluate: _Evaluator,
-) -> tuple[UInt8[np.ndarray, "u v w"], Int[np.ndarray, "u v w"]]:
+) -> tuple[UInt8[ndarray, "u v w"], Int[ndarray, "u v w"]]:
     """Labels and rows of the next lattice, ``step`` fine nodes apart.
 
     Active cells are evaluated, others filled with their corners' label. Then every skipped node next to one of another
@@ -167,9 +165,7 @@ def _halve(
     return fine_labels, fine_rows
 
 
-def _contradicted(
-    labels: GridLabels, skipped: Bool[np.ndarray, "x y z"], news: Int[np.ndarray, "m 3"]
-) -> Bool[np.ndarray, "x y z"]:
+def _contradicted(labels: GridLabels, skipped: VoxelMask, news: Int[ndarray, "m 3"]) -> VoxelMask:
     """Skipped nodes that touch one of the nodes ``news`` with another label.
 
     The largest and smallest label among those it touches tell: two passes of bytes instead of 26 lists of indices.
@@ -178,11 +174,11 @@ def _contradicted(
     largest, smallest = np.zeros_like(labels), np.full_like(labels, 255)
     largest[place] = smallest[place] = labels[place]
     largest, smallest = _over_neighbors(largest, np.maximum), _over_neighbors(smallest, np.minimum)
-    contradicted: np.ndarray = skipped & ((largest > labels) | (smallest < labels))
+    contradicted: ndarray = skipped & ((largest > labels) | (smallest < labels))
     return contradicted
 
 
-def _over_neighbors(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
+def _over_neighbors(values: ndarray, combine: np.ufunc) -> ndarray:
     """Values of each node or cell and the 26 around it, joined by ``combine``."""
     for axis in range(3):
         grown = values.copy()
@@ -270,7 +266,7 @@ def _grid(box: Corners, resolution: int) -> tuple[Vector, Vector, tuple[int, int
     step = float(size.max()) / resolution
     x, y, z = (int(n) + 1 for n in np.ceil(size / step - 1e-6))
     check_nodes(resolution, x, y, z)
-    return box[0].astype(np.float64), np.full(3, step), (x, y, z)
+    return box[0].astype(float), np.full(3, step), (x, y, z)
 
 
 def check_nodes(resolution: int, x: int, y: int, z: int) -> None:
@@ -331,7 +327,7 @@ def _check_occupied(grid: LabelGrid) -> None:
         )
 
 
-def _grown(box: Corners, sides: Bool[np.ndarray, "2 3"], fraction: float) -> Corners:
+def _grown(box: Corners, sides: Bool[ndarray, "2 3"], fraction: float) -> Corners:
     step = fraction * longest_side(box)
     return box + step * sides * np.array([[-1.0], [1.0]])
 
@@ -357,14 +353,14 @@ def _margin(
     rows: GridRows,
     logits: Logits,
     held: list[int],
-) -> Float[np.ndarray, "x y z"]:
+) -> Float[ndarray, "x y z"]:
     """Margin at each node: the largest logit of ``held`` less that of the others, its sign by the label.
 
     Where nothing was evaluated only the sign counts. A tie would put a vertex on a node, and marching cubes would make
     faces without area there; so ties are moved by a millionth.
     """
     known = rows >= 0
-    values = logits[rows[known]].astype(np.float64)
+    values = logits[rows[known]].astype(float)
     largest = values[:, held].max(axis=1)
     values[:, held] = -np.inf
     margin = np.where(np.isin(labels, held), 1.0, -1.0)

@@ -10,16 +10,27 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from numpy.linalg import inv, lstsq, norm, svd
+from numpy.random import default_rng
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import NOT_KNOWN, DepthImage, PointCloud, SharedNoise, SightKind, SightLines, into_camera
+from mereo.geometry.camera import (
+    NOT_KNOWN,
+    DepthImage,
+    PixelMask,
+    PixelValues,
+    PointCloud,
+    SharedNoise,
+    SightKind,
+    SightLines,
+    into_camera,
+)
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
 from mereo.geometry.surface_patches import noise_of_differences, second_differences
-from mereo.geometry.transforms import Points, Transform, longest_side, transform_points
+from mereo.geometry.transforms import Flags, Indices, Points, Transform, Values, longest_side, transform_points
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
 from mereo.reconstruction.isolation import (
@@ -101,7 +112,7 @@ class Observation:
         """Phrase for where the object is looked for."""
         return "in this frame" if self.point is None else "at the point {} {}".format(*self.point)
 
-    def kept_pixels(self) -> Bool[np.ndarray, "h w"]:
+    def kept_pixels(self) -> PixelMask:
         """Measured pixels of the depth image that isolation keeps."""
         assert self.frame.depth is not None
         kept = self.frame.depth.valid.copy()
@@ -265,7 +276,7 @@ def _is_straight(points: Points) -> bool:
     """Whether enough points lie on a line or at one place; fewer are refused by that."""
     if len(points) < MIN_POINTS:
         return False
-    along, across, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    along, across, _ = svd(points - points.mean(axis=0), compute_uv=False)
     return bool(across <= STRAIGHT * along)
 
 
@@ -308,7 +319,7 @@ def clusters_warning(observation: Observation) -> str | None:
     first, second = points[label == 0], points[label == 1]
     if len(second) < max(MIN_POINTS, LIKE_SIZE * len(first)):
         return None
-    gap, size = cKDTree(first).query(second)[0].min(), np.linalg.norm(np.ptp(second, axis=0))
+    gap, size = cKDTree(first).query(second)[0].min(), norm(np.ptp(second, axis=0))
     if gap < APART * size:
         return None
     metres, name = observation.frame.metres, observation.frame.length_name
@@ -348,9 +359,9 @@ def hidden_share(points: Points) -> float:
     points = random_subset(points, MAX_POINTS)
     if len(points) <= RING:
         return 0.0
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     sight = points / np.maximum(distance, 1e-300)[:, None]
-    flat = sight @ np.linalg.svd(sight.mean(axis=0)[None])[2][1:].T
+    flat = sight @ svd(sight.mean(axis=0)[None])[2][1:].T
     probes = random_subset(np.arange(len(points)), PROBES)
     angle, ring = cKDTree(flat).query(flat[probes], k=RING + 1)
     ordered = np.sort(distance[ring], axis=1)
@@ -446,14 +457,14 @@ def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Exte
     else:
         T_camera_input = into_camera(points[is_object], frame.axes)
         lines = lines_of_points(transform_points(T_camera_input, points), is_object)
-        lines = lines.transformed(np.linalg.inv(T_camera_input))
+        lines = lines.transformed(inv(T_camera_input))
     return replace(lines, unknown=np.empty((0, 3)), other_lines="past") if extent == "whole" else lines
 
 
 # --- depth images ----------------------------------------------------------------------------------------------------
 
 
-def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLines:
+def lines_of_image(whole: DepthImage, shown: PixelMask) -> SightLines:
     """Lines of sight around the object in a depth image, in the camera frame and the image's unit.
 
     They are those of pixels within one size of the object around its box. Where hardly any of them met something, zeros
@@ -484,7 +495,7 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     return SightLines(places[met], places[~met], None if silent else "unknown", shared_noise(whole, shown))
 
 
-def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoise:
+def shared_noise(whole: DepthImage, shown: PixelMask) -> SharedNoise:
     """Measure the noise of a camera that neighbours share, at the distance of ``shown`` pixels.
 
     What the largest plane around them leaves over beyond the noise of single pixels, where it is about as far away;
@@ -497,7 +508,7 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoi
         return NOT_KNOWN
     distance = float(np.median(depth[shown & whole.valid]))
 
-    def terms(pixels: Int[np.ndarray, " n"]) -> Points:
+    def terms(pixels: Indices) -> Points:
         """What inverse depth is linear in along a plane."""
         return np.stack([pixels % width, pixels // width, np.full(len(pixels), width)], axis=1) / width
 
@@ -506,12 +517,12 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoi
     points = whole.camera.unproject(width * places[:, :2] + 0.5, 1.0 / inverse)
     focal_px = min(whole.camera.focal_x_px, whole.camera.focal_y_px)
     pixel = points[:, 2] / focal_px
-    plane = largest_plane(points, pixel, np.random.default_rng(0))
+    plane = largest_plane(points, pixel, default_rng(0))
     if plane is None:
         return NOT_KNOWN
     is_on = plane.distance(points) <= pixel
     for _ in range(FITS):
-        linear = np.linalg.lstsq(places[is_on], inverse[is_on])[0]
+        linear = lstsq(places[is_on], inverse[is_on])[0]
         off = inverse - places @ linear
         noise = float(np.sqrt(np.mean(off[is_on] ** 2)))
         is_on = np.abs(off) <= ON_PLANE * noise
@@ -529,13 +540,13 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoi
     left = flat.reshape(height, width)
     alone = noise_of_differences(second_differences(left, 1), second_differences(left.T, 1))
     places, inverse = terms(rows), 1.0 / flat[rows]
-    off = inverse - places @ np.linalg.lstsq(places, inverse)[0]
+    off = inverse - places @ lstsq(places, inverse)[0]
     shared = float(np.sqrt(max(np.mean(off**2) - alone**2, 0.0)))
     side = shared_side(field.reshape(height, width)) / focal_px
     return SharedNoise(shared * distance * max(distance, float(np.median(flat[rows]))), side, 1.0 / focal_px)
 
 
-def shared_side(noise: Float[np.ndarray, "h w"]) -> float:
+def shared_side(noise: PixelValues) -> float:
     """Side, in pixels, of a square of as many pixels as share an error; NaN is where none is known.
 
     That is the integral of the correlation, by its course along rows and columns, as far as it is not noise.
@@ -552,9 +563,7 @@ def shared_side(noise: Float[np.ndarray, "h w"]) -> float:
     return float(np.sqrt(2 * np.pi * along @ together[: len(along)] / together[0]))
 
 
-def _evenly(
-    u: Int[np.ndarray, " n"], v: Int[np.ndarray, " n"], distance: Float[np.ndarray, " n"], limit: int
-) -> Bool[np.ndarray, " n"]:
+def _evenly(u: Indices, v: Indices, distance: Values, limit: int) -> Flags:
     """At most ``limit`` of some pixels: all near the object, farther off those of ever coarser grids.
 
     The pitch of the grid grows with the distance from the object, in pixels, but it is 1 up to ``DENSE``, even where
@@ -575,9 +584,7 @@ def _evenly(
     return kept
 
 
-def _on_grids(
-    u: Int[np.ndarray, " n"], v: Int[np.ndarray, " n"], octaves: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def _on_grids(u: Indices, v: Indices, octaves: Values) -> Flags:
     """Pixels of which both coordinates are multiples of 2^k, where k is ``octaves`` rounded up, and 0 at least."""
     between = (1 << np.maximum(np.ceil(octaves), 0.0).astype(np.int64)) - 1
     return (u | v) & between == 0
@@ -586,14 +593,14 @@ def _on_grids(
 # --- clouds ----------------------------------------------------------------------------------------------------------
 
 
-def lines_of_points(points: Points, is_object: Bool[np.ndarray, " n"]) -> SightLines:
+def lines_of_points(points: Points, is_object: Flags) -> SightLines:
     """Lines of sight to the points of a cloud that are not the object's; the rest is left open.
 
     Args:
         points: camera frame.
         is_object: which are the object's.
     """
-    ranges = np.linalg.norm(points, axis=1)
+    ranges = norm(points, axis=1)
     sight = points / np.maximum(ranges, 1e-300)[:, None]
     others = np.flatnonzero(~is_object & (points[:, 2] > 0))
     if len(others) == 0 or not is_object.any():
@@ -608,7 +615,7 @@ def lines_of_points(points: Points, is_object: Bool[np.ndarray, " n"]) -> SightL
     others, angle = others[is_free], angle[is_free]
     past = angle > RIM * pitch
     ahead = tree.data.mean(axis=0)
-    across = np.linalg.svd(ahead[None])[2][1:]
+    across = svd(ahead[None])[2][1:]
     u, v = np.floor((sight[others] - ahead) @ across.T / max(pitch, 1e-12)).astype(np.int64).T
     kept = _evenly(u, v, angle / max(pitch, 1e-12), MOST_LINES)
     return SightLines(points[others[past & kept]], points[others[~past & kept]])

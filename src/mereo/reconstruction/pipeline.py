@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import Bool
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
 
@@ -22,7 +21,7 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.downsampling import random_subset
-from mereo.geometry.labels import LabelGrid, SegmentedCloud, part_of_grid
+from mereo.geometry.labels import LabelGrid, SegmentedCloud, VoxelMask, part_of_grid
 from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
 from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import Corners, Labels, Points, Rows, Transform, Vector, inverse_rigid, transform_points
@@ -289,7 +288,7 @@ def segment_points(
         from mereo.models.model import scaled_array
 
         scaled = scaled_array(calibration.scaling, logits)
-    parts = scaled[:, 1:].astype(np.float64)
+    parts = scaled[:, 1:].astype(float)
     return SegmentedCloud(
         points=points,
         labels=labels,
@@ -304,7 +303,7 @@ SPECK = 0.1
 """Length of a group of voxels, as a share of the longest one's, below which a person sees a speck and not a part."""
 
 
-def count_parts(voxels: Bool[np.ndarray, "x y z"]) -> int:
+def count_parts(voxels: VoxelMask) -> int:
     """Number of parts that voxels are in: groups that touch at faces, edges or corners, without the specks among them.
 
     A group is as long as the longest side of the box around its voxels' centres, so that a single voxel has no length.

@@ -13,6 +13,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.linalg import inv, norm
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import chdtri, ndtr
@@ -124,7 +125,7 @@ def _fit_shares(
     joints = [motion.joints[name][0] for name in leaders]
     least, most = np.transpose([joint.shares for joint in joints])
 
-    def misfit(numbers: Float[np.ndarray, " j"]) -> Float[np.ndarray, " r"]:
+    def misfit(numbers: Float[ndarray, " j"]) -> Float[ndarray, " r"]:
         moved, shares = np.empty_like(rest), least + numbers * (most - least)
         for label, deform in enumerate(motion.at(dict(zip(leaders, shares.tolist(), strict=True))), start=1):
             moved[labels == label] = deform(rest[labels == label])
@@ -139,7 +140,7 @@ def _fit_shares(
     return min(fits, key=lambda fit: float(fit.cost))
 
 
-def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Float[np.ndarray, " j"] | None:
+def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Float[ndarray, " j"] | None:
     """How far off shares may be with probability 0.95; None where the uncertainty of the points is not known.
 
     The parts are those of a radius (``RadiusParts``), without what each point has in addition: it averages out.
@@ -152,7 +153,7 @@ def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Fl
     return np.abs(ways).max(axis=1, initial=0.0) + WITHIN * norm(gaussian, axis=1)
 
 
-def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | None:
+def pose_covariance(registration: Registration) -> Float[ndarray, "6 6"] | None:
     """Covariance of ``Registration.pose``; None where the uncertainty of the points is not known.
 
     Of a rotation vector w in radians, then a translation t in the input's unit, both in the axes of the registration:
@@ -179,8 +180,8 @@ def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | No
 
 
 def _moves(
-    registration: Registration, gradient: Float[np.ndarray, "c m 3"]
-) -> tuple[Float[np.ndarray, "c p"], Float[np.ndarray, "c o"]] | None:
+    registration: Registration, gradient: Float[ndarray, "c m 3"]
+) -> tuple[Float[ndarray, "c p"], Float[ndarray, "c o"]] | None:
     """How c numbers, of which the gradient by the material points is given, are unsure; None where points are not.
 
     Their changes with independent standard normal numbers, and in each other state that explains the frame alike.

@@ -248,7 +248,7 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
             f"the state belongs to the statistical model of other weights (scene {state.scene!r}, weights "
             f"{state.weights!r}); its numbers mean nothing here: give the model of those weights"
         )
-    z, drawn = np.array(state.z, dtype=np.float64), None
+    z, drawn = np.array(state.z, dtype=float), None
     if state.draws is None:
         if len(z) != model.count:
             raise ValueError(

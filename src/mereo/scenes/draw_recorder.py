@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import default_rng
 from scipy.special import ndtri
 
 from mereo.deformation.draw_names import DrawName, NamedGenerator
@@ -28,7 +30,7 @@ Place = tuple[tuple[tuple[str, int, int], ...], DrawName]
 Key = tuple[Place, int]
 """Which draw it is: its place, and how many draws there were from the same place before it."""
 
-Shares = Float[np.ndarray, " n"]
+Shares = Float[ndarray, " n"]
 
 SMOOTH = ("uniform", "normal", "triangular")
 """Kinds of draws between whose values there is a way: they move the state continuously. The others stay as they are."""
@@ -64,7 +66,7 @@ class Call:
     low: Shares
     high: Shares
     shape: tuple[int, ...]
-    ends: Float[np.ndarray, " o"] | None = None
+    ends: Float[ndarray, " o"] | None = None
 
 
 class Recorder(NamedGenerator):
@@ -79,7 +81,7 @@ class Recorder(NamedGenerator):
         super().__init__(np.random.PCG64([seed, 1]))
         self.calls: list[Call] = []
         self._given, self._most = given, most
-        self._fresh = np.random.default_rng([seed, 0])
+        self._fresh = default_rng([seed, 0])
         self._seen: Counter[Place] = Counter()
         self._ends: Any = None
 
@@ -176,7 +178,7 @@ def _shape(size: Any, *parameters: Any) -> tuple[int, ...]:
     return (int(size),) if np.ndim(size) == 0 else tuple(int(n) for n in size)
 
 
-def _options(given: Any) -> np.ndarray:
+def _options(given: Any) -> ndarray:
     """What numpy's generators choose from: an array, or the numbers below one."""
     return np.arange(given) if np.ndim(given) == 0 else np.asarray(given)
 

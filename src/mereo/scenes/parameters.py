@@ -17,6 +17,8 @@ from zlib import crc32
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import default_rng
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformations
@@ -165,7 +167,7 @@ def _without_refused(scene: Scene, seed: int, calls: tuple[Call, ...], deformati
     return calls
 
 
-def _witness(scene: Scene, deformations: Deformations) -> Float[np.ndarray, "w 3"]:
+def _witness(scene: Scene, deformations: Deformations) -> Float[ndarray, "w 3"]:
     """Where a few vertices of each segment go."""
     return np.concatenate(
         [
@@ -268,7 +270,7 @@ def turned(shares: Shares, turn: float, seed: int | tuple[int, int]) -> Shares:
     As normal numbers z they go round a circle through other ones w: z cos + w sin has the same distribution everywhere
     on it (elliptical slice sampling, Murray et al., AISTATS 2010, walks on the same curve). 0 and 1 are the start.
     """
-    other = np.random.default_rng(seed).normal(size=len(shares))
+    other = default_rng(seed).normal(size=len(shares))
     angle = 2 * np.pi * turn
     return ndtr(np.cos(angle) * ndtri(shares) + np.sin(angle) * other)
 
@@ -293,7 +295,7 @@ def _share(call: Call, parameter: Parameter, value: float) -> float:
 class _InOrder(Recorder):
     """Recorder that is given its draws in the order of the calls; more or other ones raise ``OutOfDraws``."""
 
-    def __init__(self, seed: int, shares: Sequence[np.ndarray]) -> None:
+    def __init__(self, seed: int, shares: Sequence[ndarray]) -> None:
         super().__init__(seed, {})
         self._shares = shares
 
@@ -304,9 +306,7 @@ class _InOrder(Recorder):
         return self._shares[number]
 
 
-def played_back(
-    scene: Scene, seed: int, shares: Sequence[np.ndarray], cure: str = "register the frame again"
-) -> Played:
+def played_back(scene: Scene, seed: int, shares: Sequence[ndarray], cure: str = "register the frame again") -> Played:
     """State of a scene by the shares of each call; raises ``Refused``, with a ``cure``, where it does not take them."""
     played = _played_by(scene, seed, _InOrder(seed, shares))
     if played is None:

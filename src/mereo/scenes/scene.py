@@ -44,7 +44,7 @@ class SourceFrame:
         """Inverse of ``facts``; None for files from before it was known."""
         if facts is None:
             return None
-        return cls(np.asarray(facts["T_scene_source"], dtype=np.float64), facts["unit_m"], facts.get("space"))
+        return cls(np.asarray(facts["T_scene_source"], dtype=float), facts["unit_m"], facts.get("space"))
 
 
 GUESSED_UNIT_M = 0.01

@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
-from numpy.linalg import inv
+from numpy import ndarray
+from numpy.linalg import inv, solve
+from numpy.random import default_rng
 from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
@@ -30,10 +32,10 @@ from mereo.io.object_storage import Place, write_whole
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import SourceFrame
 
-MaterialPoints = Float[np.ndarray, "m 3"]
+MaterialPoints = Float[ndarray, "m 3"]
 """Positions of the material points, in rows."""
 
-PerMode = Float[np.ndarray, " k"]
+PerMode = Float[ndarray, " k"]
 """A number for each mode."""
 
 # --- distances that all states keep -----------------------------------------------------------------------------------
@@ -57,10 +59,10 @@ FLOOR = 0.002
 class PairDistances:
     """Pairs of material points, and mean and standard deviation of their distance; there may be none."""
 
-    first: Int[np.ndarray, " q"]
-    second: Int[np.ndarray, " q"]
-    mean: Float[np.ndarray, " q"]
-    std: Float[np.ndarray, " q"]
+    first: Int[ndarray, " q"]
+    second: Int[ndarray, " q"]
+    mean: Float[ndarray, " q"]
+    std: Float[ndarray, " q"]
 
     def __len__(self) -> int:
         return len(self.first)
@@ -72,17 +74,17 @@ class PairDistances:
 
 
 def kept_distances(
-    tried: Int[np.ndarray, " v"],
+    tried: Int[ndarray, " v"],
     mean: MaterialPoints,
-    modes: Float32[np.ndarray, "m 3 k"],
-    library: Float32[np.ndarray, "n k"],
+    modes: Float32[ndarray, "m 3 k"],
+    library: Float32[ndarray, "n k"],
     half: float,
 ) -> PairDistances:
     """Distances among the ``tried`` material points that the states keep; see ``LEAST_RATIO``.
 
     ``mean``, ``modes`` and ``library`` are the linear model's, ``half`` is half of the rest box's longest side.
     """
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     first, second = np.triu_indices(len(tried), 1)
     middle, motion = mean[tried].astype(np.float32), modes[tried]
     states = library[rng.permutation(len(library))[:TRIED_STATES]]
@@ -94,14 +96,12 @@ def kept_distances(
     kept = np.flatnonzero(np.sqrt(((linear - center) ** 2).mean(axis=0)) > LEAST_RATIO * std)
     if len(kept) > MOST_PAIRS:
         kept = np.sort(rng.choice(kept, MOST_PAIRS, replace=False))
-    return PairDistances(
-        tried[first[kept]], tried[second[kept]], center[kept].astype(np.float64), std[kept].astype(np.float64)
-    )
+    return PairDistances(tried[first[kept]], tried[second[kept]], center[kept].astype(float), std[kept].astype(float))
 
 
 def _distances(
-    mean: Float32[np.ndarray, "v 3"], modes: Float32[np.ndarray, "v 3 k"], z: Float32[np.ndarray, "n k"]
-) -> Float32[np.ndarray, "n v v"]:
+    mean: Float32[ndarray, "v 3"], modes: Float32[ndarray, "v 3 k"], z: Float32[ndarray, "n k"]
+) -> Float32[ndarray, "n v v"]:
     """Between all pairs of points in each state."""
     points = mean + (z @ modes.reshape(3 * len(mean), z.shape[1]).T).reshape(len(z), -1, 3)
     squared = (points**2).sum(axis=2)
@@ -145,11 +145,11 @@ class StatisticalModel:
     """
 
     rest: SegmentedMesh
-    nodes: Float[np.ndarray, "j 3"]
-    node_labels: UInt8[np.ndarray, " j"]
+    nodes: Float[ndarray, "j 3"]
+    node_labels: UInt8[ndarray, " j"]
     mean: MaterialPoints
-    modes: Float32[np.ndarray, "m 3 k"]
-    library: Float32[np.ndarray, "n k"]
+    modes: Float32[ndarray, "m 3 k"]
+    library: Float32[ndarray, "n k"]
     residue: float
     pairs: PairDistances
     source_frame: SourceFrame | None = None
@@ -193,7 +193,7 @@ class StatisticalModel:
         return tuple(len(segment.vertices) for segment in self.rest.segments)
 
     @cached_property
-    def labels(self) -> UInt8[np.ndarray, " m"]:
+    def labels(self) -> UInt8[ndarray, " m"]:
         """Label of each material point."""
         owner = np.repeat(np.arange(len(self.vertex_counts)), self.vertex_counts)
         return np.concatenate([owner + 1, self.node_labels]).astype(np.uint8)
@@ -221,7 +221,7 @@ class StatisticalModel:
         return rest_frame(self.rest)[0]
 
     @cached_property
-    def anchors(self) -> tuple[Int[np.ndarray, " a"], ...]:
+    def anchors(self) -> tuple[Int[ndarray, " a"], ...]:
         """Anchors of each segment: the material points that others of it follow."""
         *firsts, count = np.cumsum([0, *self.vertex_counts])
         return tuple(
@@ -235,22 +235,22 @@ class StatisticalModel:
         return tuple(Anchors(index, self.rest_points[index]) for index in self.anchors)
 
     @cached_property
-    def silhouette_vertices(self) -> Int[np.ndarray, " w"]:
+    def silhouette_vertices(self) -> Int[ndarray, " w"]:
         """Surface vertices, evenly spread."""
         return spread(self.rest_points[: sum(self.vertex_counts)], SILHOUETTE_VERTICES)
 
     @cached_property
-    def sparse(self) -> Int[np.ndarray, " p"]:
+    def sparse(self) -> Int[ndarray, " p"]:
         """A few material points that tell shapes apart."""
         return spread(self.rest_points, SPARSE)
 
     @cached_property
-    def sparse_library(self) -> Float32[np.ndarray, "n p 3"]:
+    def sparse_library(self) -> Float32[ndarray, "n p 3"]:
         """Positions of these few in all states of the library."""
         motion = self.library @ self.modes[self.sparse].reshape(3 * len(self.sparse), self.count).T
         return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
 
-    def around(self, mean: MaterialPoints, modes: Float32[np.ndarray, "m 3 d"]) -> "StatisticalModel":
+    def around(self, mean: MaterialPoints, modes: Float32[ndarray, "m 3 d"]) -> "StatisticalModel":
         """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
         library = np.zeros((0, modes.shape[2]), dtype=np.float32)
         other = replace(self, mean=mean, modes=modes, library=library, pairs=PairDistances.none())
@@ -264,7 +264,7 @@ class StatisticalModel:
     @cached_property
     def motion(self) -> PerMode:
         """Root mean square motion of the material points for one standard deviation of each mode."""
-        squared = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
+        squared = np.einsum("mck,mck->k", self.modes, self.modes, dtype=float)
         return np.sqrt(squared / len(self.modes))
 
     @cached_property
@@ -295,7 +295,7 @@ class StatisticalModel:
     @cached_property
     def _squares(self) -> Values:
         """Logarithms of the library's mean squared coefficients, in order."""
-        squares = (self.library.astype(np.float64) ** 2).mean(axis=1)
+        squares = (self.library.astype(float) ** 2).mean(axis=1)
         return np.log(np.sort(np.maximum(squares, np.finfo(float).tiny)))
 
     def unusual(self, z: PerMode) -> float:
@@ -312,7 +312,7 @@ class StatisticalModel:
     def mesh(self, material: MaterialPoints) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""
         ends = np.cumsum(self.vertex_counts)
-        return self.rest.with_vertices(np.split(material[: ends[-1]].astype(np.float64), ends[:-1]))
+        return self.rest.with_vertices(np.split(material[: ends[-1]].astype(float), ends[:-1]))
 
     def weights(self, points: Points, labels: Labels) -> PointWeights:
         """Weights by which points at rest, of the segments ``labels`` (1 or more), follow the material points."""
@@ -320,17 +320,17 @@ class StatisticalModel:
 
     def project(self, material: MaterialPoints) -> tuple[Transform, PerMode]:
         """Pose and coefficients of a state: ``T_state_model`` and z of (nearly) least squared distance."""
-        flat = self.modes.reshape(3 * len(self.modes), self.count).astype(np.float64)
+        flat = self.modes.reshape(3 * len(self.modes), self.count).astype(float)
         normal = flat.T @ flat + 1e-9 * np.trace(flat.T @ flat) * np.eye(self.count)
         z = np.zeros(self.count)
         for _ in range(PROJECTIONS):
             T = fit_rigid(self.mean + (flat @ z).reshape(-1, 3), material)
             unposed = (material - T[:3, 3]) @ T[:3, :3]
-            z = np.linalg.solve(normal, flat.T @ (unposed - self.mean).ravel())
+            z = solve(normal, flat.T @ (unposed - self.mean).ravel())
         return fit_rigid(self.mean + (flat @ z).reshape(-1, 3), material), z
 
 
-def material_points(mesh: SegmentedMesh, nodes: Float[np.ndarray, "j 3"]) -> MaterialPoints:
+def material_points(mesh: SegmentedMesh, nodes: Float[ndarray, "j 3"]) -> MaterialPoints:
     """Vertices of all segments, then the nodes."""
     return np.concatenate([*(segment.vertices for segment in mesh.segments), nodes])
 
@@ -361,7 +361,7 @@ LIBRARY_STEP, WIDE_MODES = 1 / 32, 12
 """Step of a coefficient, whose bytes reach to 4 standard deviations, and how many first modes have two bytes."""
 
 
-def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], JsonObject]:
+def pack_model(model: StatisticalModel) -> tuple[dict[str, ndarray], JsonObject]:
     """Tensors of a statistical model, and the facts about it that are none: names, colours, sizes, residue."""
     wide, wide_scale = _integers(model.modes[..., :WIDE_MODES], np.int16)
     narrow, narrow_scale = _integers(model.modes[..., WIDE_MODES:], np.int8)
@@ -398,13 +398,13 @@ def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], JsonObje
 
 def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel:
     """Inverse of ``pack_model`` up to rounding."""
-    index, (mean, std) = tensors["pair_index"].astype(np.int64), tensors["pair_distance"].astype(np.float64)
+    index, (mean, std) = tensors["pair_index"].astype(np.int64), tensors["pair_distance"].astype(float)
     steps = np.concatenate([tensors["wide_modes"], tensors["modes"]], axis=2, dtype=np.float32)
     return StatisticalModel(
         rest=_rest(tensors, facts),
-        nodes=tensors["nodes"].astype(np.float64),
+        nodes=tensors["nodes"].astype(float),
         node_labels=tensors["node_labels"],
-        mean=tensors["mean"].astype(np.float64),
+        mean=tensors["mean"].astype(float),
         modes=steps * tensors["mode_scale"],
         library=tensors["library"].astype(np.float32) * np.float32(LIBRARY_STEP),
         residue=float(facts["residue"]),
@@ -470,21 +470,21 @@ def modes_within(model: StatisticalModel, size: int) -> int:
 
 
 def _integers(
-    modes: Float32[np.ndarray, "m 3 k"], dtype: type[np.signedinteger]
-) -> tuple[Int[np.ndarray, "m 3 k"], Float32[np.ndarray, " k"]]:
+    modes: Float32[ndarray, "m 3 k"], dtype: type[np.signedinteger]
+) -> tuple[Int[ndarray, "m 3 k"], Float32[ndarray, " k"]]:
     """Modes in steps of their largest motion, and the motion that one step of each stands for."""
     scale = (np.abs(modes).max(axis=(0, 1), initial=1e-12) / np.iinfo(dtype).max).astype(np.float32)
     return np.rint(modes / scale).astype(dtype), scale
 
 
-def _narrow(index: np.ndarray) -> np.ndarray:
+def _narrow(index: ndarray) -> ndarray:
     """Indices in two bytes where they fit."""
     return index.astype(np.uint16 if index.size == 0 or index.max() < 2**16 else np.uint32)
 
 
 def _rest(tensors: Tensors, facts: Mapping[str, Any]) -> SegmentedMesh:
     """The segments at rest."""
-    vertices, faces = tensors["vertices"].astype(np.float64), tensors["faces"].astype(np.int64)
+    vertices, faces = tensors["vertices"].astype(float), tensors["faces"].astype(np.int64)
     first, start, segments = 0, 0, []
     for name, color, solid, points, triangles in zip(
         *(facts[key] for key in ("names", "colors", "solid", "vertices", "faces")), strict=True

@@ -7,12 +7,11 @@ Occluders are solid bodies with a depth of their own (sources in docs/design/000
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int
 from numpy.linalg import norm
 from numpy.random import Generator
 
 from mereo.geometry.solids import Hits, Solids, toward
-from mereo.geometry.transforms import Labels, Matrix, Points, Values, Vector
+from mereo.geometry.transforms import Labels, Matrix, Points, Subset, Values, Vector
 from mereo.synthesis.config import Occluder, SensorConfig
 
 NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)
@@ -27,7 +26,7 @@ class Capsule:
     end: Vector
     radius: float
 
-    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Subset, Hits]:
         """Rows of the rays from the origin that hit the capsule, and where each of them does first."""
         low, high = np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
         rows = toward(directions, low, high)
@@ -74,7 +73,7 @@ class Backdrop:
     normal: Vector
     offset: float
 
-    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Subset, Hits]:
         """Rows of the rays from the origin that hit the plane, and where."""
         slope = directions @ self.normal
         rows = np.flatnonzero(slope > 1e-6)

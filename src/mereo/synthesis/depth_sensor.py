@@ -10,12 +10,13 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 from scipy import ndimage
 
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import Camera, DepthImage, PixelMask, PixelValues
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Hits, Solids
@@ -23,14 +24,8 @@ from mereo.geometry.transforms import Labels, Points, Values, unit_rows
 from mereo.synthesis.clutter import NOTHING, OBJECT, Surroundings, sample_surroundings
 from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 
-Numbers = Float[np.ndarray, "*n"]
+Numbers = Float[ndarray, "*n"]
 """Numbers in any shape, which the whole signature has."""
-
-PixelValues = Float[np.ndarray, "h w"]
-"""A number for each pixel."""
-
-PixelMask = Bool[np.ndarray, "h w"]
-"""Whether each pixel is meant."""
 
 STEEPEST_RAD = float(np.deg2rad(80.0))
 """Largest angle of the noise formulas, which have a pole at 90 degrees: steeper surfaces count as seen at this one."""
@@ -54,7 +49,7 @@ class SimulatedView:
 
     whole: DepthImage
     mask: PixelMask
-    source: UInt8[np.ndarray, "h w"]
+    source: UInt8[ndarray, "h w"]
 
     @property
     def image(self) -> DepthImage:
@@ -265,7 +260,7 @@ def sample_mask(seen: PixelMask, sensor: SensorConfig, streams: dict[str, Genera
 
 
 @lru_cache(maxsize=8)
-def _bumps(size: int, nodes: int) -> Float[np.ndarray, "s n"]:
+def _bumps(size: int, nodes: int) -> Float[ndarray, "s n"]:
     """Weights of the nodes at each pixel; their squares sum to 1."""
     pixels, centers = np.arange(size)[:, None] / max(size - 1, 1), np.linspace(0, 1, nodes)
     weights = np.exp(-0.5 * ((pixels - centers) * (nodes - 1) / 0.7) ** 2)

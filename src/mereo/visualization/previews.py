@@ -9,6 +9,7 @@ from dataclasses import replace
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.linalg import norm
 
 from mereo.geometry.camera import PointCloud
@@ -148,7 +149,7 @@ def _from_side(view: View, size: int, up: Vector) -> Picture:
     return shade(shown, replace(side, half_size=1.4 * radius), (size, size))
 
 
-def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radius: float) -> Segment:
+def _arrow(center: Float[ndarray, "3"], toward: Float[ndarray, "3"], radius: float) -> Segment:
     """A cone on a thin shaft outside the object, pointing at it along the camera's line of sight."""
     # (thickness, distance from the centre), both in radii, from the tip to the end of the shaft
     profile = ((0.0, 0.85), (0.08, 1.03), (0.03, 1.03), (0.03, 1.35), (0.0, 1.35))

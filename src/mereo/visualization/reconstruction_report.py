@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int, UInt16
+from numpy import ndarray
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -34,7 +35,7 @@ from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh
 from mereo.geometry.radii import Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
-from mereo.geometry.transforms import Indices, Labels, Matrix, Points, Vector
+from mereo.geometry.transforms import Indices, Labels, Matrix, Points, Subset, Vector
 from mereo.io.atomic_files import JsonObject, atomic_file
 from mereo.io.errors import AnyPath
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
@@ -164,11 +165,11 @@ def _joint_bounds(points: Points, surfaces: SegmentedMesh) -> tuple[Vector, Vect
     return low, np.maximum(high, low + 1e-9 * max(1.0, float(np.abs(low).max())))
 
 
-def _quantize(points: Points, low: Vector, high: Vector) -> UInt16[np.ndarray, "n 3"]:
+def _quantize(points: Points, low: Vector, high: Vector) -> UInt16[ndarray, "n 3"]:
     return np.rint((points - low) / (high - low) * STEPS).astype("<u2")
 
 
-def _base64(array: np.ndarray) -> str:
+def _base64(array: ndarray) -> str:
     return base64.b64encode(array.tobytes()).decode("ascii")
 
 
@@ -197,7 +198,7 @@ def cluster(segment: Segment, cell: float) -> Segment:
     return Segment(segment.name, segment.color, np.stack(sums, axis=1) / count[:, None], faces[np.sort(first)])
 
 
-def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Indices]:
+def _same(rows: Int[ndarray, "n 3"]) -> tuple[Subset, Indices]:
     """First index of each different row, and for each row which one it is; packed, because sorting rows is slow."""
     base = int(rows.max(initial=0)) + 1
     packed = (rows[:, 0] * base + rows[:, 1]) * base + rows[:, 2]

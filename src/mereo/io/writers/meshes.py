@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import UInt8
+from numpy import ndarray
 from numpy.linalg import norm
 
 from mereo.geometry.labels import SegmentedCloud
-from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
+from mereo.geometry.mesh import Color, Colors, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import Points
 from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, write_file
@@ -116,7 +116,7 @@ def write_positions_ply(path: AnyPath, points: Points, comment: str = "") -> Non
     _write(path, [comment] if comment else [], {"vertex": _records(_positions(points))})
 
 
-Columns = dict[str, tuple[str, np.ndarray]]
+Columns = dict[str, tuple[str, ndarray]]
 """Type and values of each property, in the order of the file."""
 
 
@@ -124,7 +124,7 @@ def _positions(points: Points) -> Columns:
     return {axis: ("f4", points[:, k]) for k, axis in enumerate("xyz")}
 
 
-def _colors(colors: UInt8[np.ndarray, "n 3"]) -> Columns:
+def _colors(colors: Colors) -> Columns:
     return {channel: ("u1", colors[:, k]) for k, channel in enumerate(("red", "green", "blue"))}
 
 
@@ -133,7 +133,7 @@ def _comments(names: Sequence[str], colors: Sequence[Color]) -> list[str]:
     return [f"segment {json.dumps(row)}" for row in segment_table(names, colors)]
 
 
-def _records(columns: Columns) -> np.ndarray:
+def _records(columns: Columns) -> ndarray:
     fields = [(name, f"<{kind}", values.shape[1:]) for name, (kind, values) in columns.items()]
     records = np.zeros(len(next(iter(columns.values()))[1]), np.dtype(fields))
     for name, (_, values) in columns.items():
@@ -141,7 +141,7 @@ def _records(columns: Columns) -> np.ndarray:
     return records
 
 
-def _write(path: AnyPath, comments: list[str], elements: dict[str, np.ndarray]) -> None:
+def _write(path: AnyPath, comments: list[str], elements: dict[str, ndarray]) -> None:
     types = {"u1": "uchar", "i4": "int", "f4": "float"}
     lines = ["ply", "format binary_little_endian 1.0", "comment written by mereo", *(f"comment {c}" for c in comments)]
     for element, records in elements.items():

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
+from numpy import ndarray
 
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
@@ -49,7 +50,7 @@ compressor="vtkZLibDataCompressor">
 """
 
 
-def write_labels_npz(path: AnyPath, grid: LabelGrid, radii: Float32[np.ndarray, "x y z"] | None = None) -> None:
+def write_labels_npz(path: AnyPath, grid: LabelGrid, radii: Float32[ndarray, "x y z"] | None = None) -> None:
     """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
     Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
@@ -63,8 +64,8 @@ def write_labels_npz(path: AnyPath, grid: LabelGrid, radii: Float32[np.ndarray, 
         np.savez_compressed(
             partial,
             labels=grid.labels,
-            origin=np.asarray(grid.origin, dtype=np.float64),
-            spacing=np.asarray(grid.spacing, dtype=np.float64),
+            origin=np.asarray(grid.origin, dtype=float),
+            spacing=np.asarray(grid.spacing, dtype=float),
             names=np.asarray(grid.names),
             **sure,
         )
@@ -92,7 +93,7 @@ def write_labels_vti(
     path: AnyPath,
     grid: LabelGrid,
     colors: Sequence[Color],
-    radii: Float32[np.ndarray, "x y z"] | None = None,
+    radii: Float32[ndarray, "x y z"] | None = None,
 ) -> None:
     """Write VTK image data: the array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
 
@@ -113,7 +114,7 @@ def write_labels_vti(
     write_file(path, text)
 
 
-def _compressed(values: np.ndarray) -> str:
+def _compressed(values: ndarray) -> str:
     """Values as one zlib block; its head has the number of blocks, the bytes of each, of a partial one, and packed."""
     packed = zlib.compress(values.tobytes(order="F"))
     head = struct.pack("<4Q", 1, values.nbytes, 0, len(packed))
@@ -201,7 +202,7 @@ def write_labels_seg_nrrd(path: AnyPath, grid: LabelGrid, colors: Sequence[Color
     write_file(path, _nrrd("NRRD0004", grid.labels, _T_lps_index(grid, unit_m), fields, 9))
 
 
-def _nrrd(magic: str, values: np.ndarray, T_lps_index: Transform, fields: dict[str, str], level: int) -> bytes:
+def _nrrd(magic: str, values: ndarray, T_lps_index: Transform, fields: dict[str, str], level: int) -> bytes:
     header = NRRD_HEADER.format(
         magic=magic,
         type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),

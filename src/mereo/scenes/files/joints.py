@@ -10,7 +10,9 @@ from itertools import combinations, product
 
 import numpy as np
 from jaxtyping import Float
-from numpy.linalg import norm
+from numpy import ndarray
+from numpy.linalg import eigh, lstsq, norm
+from numpy.random import default_rng
 
 from mereo.deformation.maps import Compose, Rigid
 from mereo.geometry.conventions import Range
@@ -133,13 +135,13 @@ def _largest_plane(points: Points, normals: Points, reach: float) -> Flags:
 
 def _longest(points: Points) -> tuple[Vector, float]:
     """Direction in which points spread most, and how far."""
-    along = np.linalg.eigh(np.cov(points.T))[1][:, -1]
+    along = eigh(np.cov(points.T))[1][:, -1]
     return along, float(np.ptp(points @ along))
 
 
 def _cylinder(first: int, second: int, points: Points, normals: Points) -> Contact | None:
     """Cylinder through points with its normals; None where they are of none."""
-    values, vectors = np.linalg.eigh(normals.T @ normals / len(normals))
+    values, vectors = eigh(normals.T @ normals / len(normals))
     if values[0] > FLATTEST or values[1] < LEAST_ARC:
         return None
     axis, across = vectors[:, 0], vectors[:, 1:]
@@ -148,7 +150,7 @@ def _cylinder(first: int, second: int, points: Points, normals: Points) -> Conta
     system = np.zeros((2 * len(points), 3))
     system[0::2, 0] = system[1::2, 1] = 1.0
     system[:, 2] = outward.ravel()
-    solution = np.linalg.lstsq(system, flat.ravel(), rcond=None)[0]
+    solution = lstsq(system, flat.ravel(), rcond=None)[0]
     center, radius = solution[:2], abs(float(solution[2]))
     misfit = norm(flat - center, axis=1) - radius
     if not np.sqrt(np.mean(misfit**2)) < MISFIT * radius:
@@ -370,9 +372,9 @@ def _narrowed(test: _CollisionTest, joints: Sequence[Joint]) -> tuple[Joint, ...
     return tuple(joint for joint in narrow if joint.most[1] > joint.most[0])
 
 
-def _combinations(joints: int, states: int) -> Float[np.ndarray, "states joints"]:
+def _combinations(joints: int, states: int) -> Float[ndarray, "states joints"]:
     """Shares of joints' ranges, -1 at the least and 1 at the most: corners, with some at rest, and random ones."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     if 2**joints <= states // 2:
         corners = np.array(list(product((-1.0, 1.0), repeat=joints)))
     else:
@@ -384,8 +386,8 @@ def _combinations(joints: int, states: int) -> Float[np.ndarray, "states joints"
 def _blamed(
     test: _CollisionTest,
     joints: Sequence[Joint],
-    share: Float[np.ndarray, " joints"],
-    ranges: Float[np.ndarray, "joints 2"],
+    share: Float[ndarray, " joints"],
+    ranges: Float[ndarray, "joints 2"],
 ) -> set[tuple[int, int]]:
     """Joints, and the side (0 for the least, 1 for the most) of their ranges, that bring segments into collision."""
     ways = (np.maximum(share, 0.0) * ranges[:, 1] + np.maximum(-share, 0.0) * ranges[:, 0]).tolist()

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 import yaml
-from numpy.linalg import norm
+from numpy.linalg import norm, svd
 from scipy.spatial import ConvexHull, QhullError
 
 from mereo.deformation.maps import moved_by, unit
@@ -239,7 +239,7 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> Flat
     if areas[on].sum() / 2 < LEAST_COVER * LEAST_BASE * hull.area:
         return None
     normal = unit(crossed[on].sum(axis=0))
-    across = np.linalg.svd(normal[None])[2][1:]
+    across = svd(normal[None])[2][1:]
     outline = ConvexHull(solid.vertices[np.unique(solid.faces[on])] @ across.T)
     center = (solid if solid.volume > 0.01 * hull.volume else hull).center_mass  # of open meshes it is nonsense
     inside = -float((outline.equations[:, :2] @ (across @ center) + outline.equations[:, 2]).max())
