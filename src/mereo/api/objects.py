@@ -301,7 +301,7 @@ def _scene(source: Source, meshes: MeshesConfig) -> Scene:
     assert not isinstance(source, Trained)
     if (mesh := mesh_of(source)) is not None:
         return _scene_in_memory(mesh, meshes)
-    given: Sequence[object] = [source] if isinstance(source, str | Path) else source
+    given = [source] if isinstance(source, str | Path) else source
     if not isinstance(given, Sequence) or not all(isinstance(file, str | Path) and str(file) for file in given):
         raise ValueError(
             f"the object is {repr(source)[:80]}; it must be the path of a file or folder, a list of such paths, the "

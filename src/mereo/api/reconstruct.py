@@ -22,6 +22,7 @@ from mereo.fitting.config import AnswerMethod
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import checked_pose
+from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import Instances
 from mereo.io.config import InputConfig
 from mereo.io.point_arrays import depth_values, is_frame_list, mask_image, points_of
@@ -159,7 +160,7 @@ def _frame_in_memory(source: object, axes: CloudAxes | None, intrinsics: Any, re
     return SensorFrame(CLOUD, observed, unit_m, reading.frame, invalid=invalid)
 
 
-def split_options(isolation: Any, options: dict[str, Any]) -> tuple[IsolationConfig, dict[str, Any]]:
+def split_options(isolation: Any, options: JsonObject) -> tuple[IsolationConfig, JsonObject]:
     """Settings of isolation, with what of ``options`` is a field of them, and the other options."""
     if not isinstance(isolation, IsolationConfig | Mapping | None):
         raise ValueError(
@@ -172,7 +173,7 @@ def split_options(isolation: Any, options: dict[str, Any]) -> tuple[IsolationCon
     return replace(stated, **changes), options
 
 
-def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
+def observation_of(frame: Any, isolation: IsolationConfig, reading: JsonObject) -> Observation:
     """Object in a frame, whatever holds it."""
     if isinstance(frame, Observation) and replace(isolation, keep_all=False) != IsolationConfig():
         raise ValueError("isolation is given for an object that is isolated already: give it to find_object")
@@ -244,7 +245,7 @@ def reconstruct(
     are_many = is_frame_list(frame) or (
         isinstance(frame, list | tuple) and any(isinstance(each, SensorFrame | Observation) for each in frame)
     )
-    instances: Instances = options.pop("instances", 1)
+    instances = options.pop("instances", 1)
     with python_words():
         isolation, reading = split_options(isolation, options)
         known = object_of(object, **{name: reading.pop(name) for name in ("joints", *OPTIONS) if name in reading})

@@ -28,11 +28,11 @@ from numpy.typing import ArrayLike
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.conventions import Names
+from mereo.geometry.conventions import Facts, Names, WholeNumbers
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import Vector, checked_pose, inverse_rigid, rigid, transform_points
-from mereo.io.atomic_files import atomic_file, new_directory, to_json
+from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, to_json
 from mereo.io.attachments import Attachment, Content, PoseTable, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.bounds import Port, check_value
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
@@ -317,7 +317,7 @@ class Result(Answer, SegmentedResult):
         poses = {} if fit is None else {part.name: fit.segment_pose(part.label) for part in parts}
         return _segment_results(parts, self.surfaces, radii, poses)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Figures as in ``summary.json``, in plain types: numbers, texts, lists, None for NaN.
 
         Of a lost object without an answer they have no segments, and ``recognition`` says why.
@@ -454,12 +454,12 @@ def _check_list(formats: object) -> None:
         raise ValueError(f"formats is {formats!r}; it must be a list of names: give for example ('glb', 'json')")
 
 
-def free_folder(name: str = "result") -> Path:
-    """Path of the first of NAME, NAME2, NAME3, ... that is not there."""
+def free_folder() -> Path:
+    """Path of the first of result, result2, result3, ... that is not there."""
     numbers = count(2)
-    path = Path(name)
+    path = Path("result")
     while path.exists() or path.is_symlink():
-        path = Path(f"{name}{next(numbers)}")
+        path = Path(f"result{next(numbers)}")
     return path
 
 
@@ -530,7 +530,7 @@ def _attachment(what: Any) -> Attachment:
     return Attachment("the points", Positions(model_points([what] if _shape(what) == (3,) else what)))
 
 
-def _shape(what: Any) -> tuple[int, ...]:
+def _shape(what: Any) -> WholeNumbers:
     """Shape of an array or list; empty of what is none."""
     with suppress(ValueError):  # of rows that differ in length
         return np.shape(what) if hasattr(what, "ndim") or isinstance(what, list | tuple) else ()
@@ -565,7 +565,7 @@ def registration_of(answer: Answer) -> Registration:
 
 
 def _segment_results(
-    parts: Iterable[Any], surfaces: SegmentedMesh, radii: Mapping[str, Any], poses: Mapping[str, Pose]
+    parts: Iterable[Any], surfaces: SegmentedMesh, radii: Facts, poses: Mapping[str, Pose]
 ) -> dict[str, SegmentResult]:
     """Segments by their names, of figures as ``SegmentFacts`` has them; radii and poses are those that are known."""
     return {
@@ -588,7 +588,7 @@ def _segment_results(
 
 
 def _numbers(values: Any) -> Any:
-    return None if values is None else np.array(values, dtype=float)
+    return None if values is None else np.array(values, float)
 
 
 def _fact(*keys: str, read: Callable[[Any], Any] = lambda value: value) -> Any:
@@ -614,7 +614,7 @@ class StoredResult(SegmentedResult):
         further: results of further instances of the object in the same frame.
     """
 
-    facts: dict[str, Any]
+    facts: JsonObject
     surfaces: SegmentedMesh | None
     labels: LabelGrid | None
     further: "tuple[StoredResult, ...]" = ()
@@ -647,7 +647,7 @@ class StoredResult(SegmentedResult):
             return {}
         return _segment_results((SimpleNamespace(**row) for row in rows), self.surfaces, radii, poses)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """As ``Result.to_dict``."""
         return deepcopy(self.facts)
 
@@ -675,7 +675,7 @@ def load_result(folder: str | Path) -> StoredResult:
         facts = json.loads(summary.read_text("utf-8"))
         if grid.names != tuple(row["name"] for row in facts["segments"]) or not meshes.keys() <= set(grid.names):
             raise ValueError(f"its segments are not those of {surfaces.name} and {labels.name}")
-        empty = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
+        empty = np.empty((0, 3)), np.empty((0, 3), np.int64)
         parts = (
             meshes.get(row["name"], Segment(row["name"], tuple(row["color"]), *empty)) for row in facts["segments"]
         )

@@ -17,6 +17,7 @@ from mereo.api.words import python_words, with_changes
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import LengthUnit
 from mereo.geometry.metrics import format_score
+from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import Positive, check_value
 from mereo.io.errors import checked_path
 from mereo.io.object_storage import ObjectPath, place_of
@@ -138,7 +139,7 @@ class Learned:
     frame: Path
     report: Path | None
     method: AnswerMethod
-    metrics: dict[str, Any]
+    metrics: JsonObject
 
     @property
     def iou(self) -> float:

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from numpy.linalg import inv
-
 from mereo.cli.options import Outcome
 from mereo.io.atomic_files import JsonObject
 
@@ -80,6 +78,8 @@ class Demo:
 
 def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, TruthGrid]]":
     """Name, title, object, frame and truth of each input; the first one's frame and meshes are written."""
+    from numpy.linalg import inv
+
     from mereo.api.objects import load_object
     from mereo.api.reconstruct import load_frame
     from mereo.geometry.camera import into_camera

@@ -18,7 +18,7 @@ from mereo.cli.options import (
     options_of,
 )
 from mereo.fitting.config import AnswerMethod
-from mereo.geometry.conventions import LengthUnit, WorkspaceName
+from mereo.geometry.conventions import LengthUnit, Pair, WorkspaceName
 from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Positive, Threads, Workers
 from mereo.io.config import CONFIG
 from mereo.io.cores import workers_for
@@ -84,7 +84,7 @@ class Generate:
         write_whole(self.output / CONFIG, json_text(options_of(self, "generate")).encode())
 
 
-def part_of(shard: str) -> tuple[int, int]:
+def part_of(shard: str) -> Pair:
     """Part and number of parts of a shard: ``"1/4"`` is part 1 of 4, counted from 0. Raises ``ValueError``."""
     part, _, parts = shard.partition("/")
     if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):

@@ -153,7 +153,7 @@ def build_lattice(mesh: SegmentedMesh, cells: int = 16, stiffness: Sequence[floa
         raise ValueError("the mesh has no inside: turn its faces outward, or take more cells for a thin one")
     share = sampled.mean(axis=(1, 3, 5))
     vertices = np.concatenate([segment.vertices for segment in mesh.segments])
-    touched = np.zeros(tuple(shape), dtype=bool)
+    touched = np.zeros(tuple(shape), bool)
     touched[tuple(np.clip(np.floor((vertices - origin) / size).astype(np.int64), 0, shape - 1).T)] = True
     cell = np.argwhere((share > 0) | touched)
     filled = np.maximum(share[tuple(cell.T)], 0.5 / SAMPLES**3)
@@ -198,7 +198,7 @@ def find_modes(solid: ElasticSolid, count: int, material: Material, held: Flags 
     held leaves it free to turn.
     """
     stiffness, mass = assemble_stiffness(solid, material), solid.mass
-    rigid, free = (6, np.ones(len(mass), dtype=bool)) if held is None else (0, ~held)
+    rigid, free = (6, np.ones(len(mass), bool)) if held is None else (0, ~held)
     rows = np.flatnonzero(np.repeat(free, 3))
     most = solid.most_modes(held)
     if not 1 <= count <= most:

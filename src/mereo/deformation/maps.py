@@ -71,7 +71,7 @@ class Rigid:
     @cached_property
     def _matrix(self) -> Matrix:
         """Turn as a matrix, made once: a chain of joints asks each for all links behind it."""
-        return np.asarray(Rotation.from_rotvec(self.rotation_vector).as_matrix())
+        return Rotation.from_rotvec(self.rotation_vector).as_matrix()
 
 
 @dataclass(frozen=True, eq=False)

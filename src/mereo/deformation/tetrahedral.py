@@ -51,8 +51,8 @@ class Tetrahedra:
                 f"a tetrahedron refers to node {int(elements.max() if elements.min() >= 0 else elements.min())}, but "
                 f"there are {len(nodes)}; indices run from 0: subtract 1 where they were counted from 1"
             )
-        self.nodes = read_only_view(np.ascontiguousarray(nodes, dtype=float))
-        self.elements = read_only_view(np.ascontiguousarray(elements, dtype=np.int64))
+        self.nodes = read_only_view(np.ascontiguousarray(nodes, float))
+        self.elements = read_only_view(np.ascontiguousarray(elements, np.int64))
         edges = _edges(self.nodes, self.elements)
         self.volumes = det(edges) / 6
         size = longest_side(self.nodes)
@@ -153,7 +153,7 @@ class TetrahedralMap:
     def __call__(self, points: Places) -> Places:
         """Images of points: affine in each tetrahedron, and continued outside of them."""
         element = self.rest.locate(points)
-        moved = np.empty_like(points, dtype=float)
+        moved = np.empty_like(points, float)
         inside = element >= 0
         first = self.rest.elements[element[inside], 0]
         offset = points[inside] - self.rest.nodes[first]
@@ -176,7 +176,7 @@ class TetrahedralMap:
         elements = self.rest.elements
         element = _locate(search_tree(self.nodes, elements), self.nodes, elements, points)
         inside = element >= 0
-        rest, converged = np.empty_like(points, dtype=float), inside.copy()
+        rest, converged = np.empty_like(points, float), inside.copy()
         first = elements[element[inside], 0]
         back = inv(self._gradients[element[inside]])
         rest[inside] = self.rest.nodes[first] + _apply(back, points[inside] - self.nodes[first])
@@ -198,8 +198,8 @@ def _locate(
     points: Places,
 ) -> Int[ndarray, " p"]:
     if len(points) == 0:  # libigl's loop expects some
-        return np.empty(0, dtype=np.int64)
-    element = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=float), tree)
+        return np.empty(0, np.int64)
+    element = igl.in_element(nodes, elements, np.ascontiguousarray(points, float), tree)
     return element.astype(np.int64)  # C's long long, which numpy tells apart
 
 
@@ -228,8 +228,8 @@ class Surface:
     """Closed surface at rest with its search tree and the spline's system, which all of its states share."""
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
-        self.vertices = read_only_view(np.ascontiguousarray(vertices, dtype=float))
-        self.faces = read_only_view(np.ascontiguousarray(faces, dtype=np.int64))
+        self.vertices = read_only_view(np.ascontiguousarray(vertices, float))
+        self.faces = read_only_view(np.ascontiguousarray(faces, np.int64))
         self.center = vertices.mean(axis=0)
         self.controls = farthest_point_order(self.vertices, CONTROLS)
         knots = self.vertices[self.controls]
@@ -267,7 +267,7 @@ class Surface:
     def carry(self, values: Vertices, points: Places) -> Places:
         """Values at vertices taken from the closest surface point, fading with its distance."""
         squared, face, place = self._tree.squared_distance(
-            self.vertices, self.faces, np.ascontiguousarray(points, dtype=float)
+            self.vertices, self.faces, np.ascontiguousarray(points, float)
         )
         corners = self.faces[face]
         weights = barycentric(self.vertices[corners], place)

@@ -17,7 +17,7 @@ from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import crossing, smooth_step, turn, unit
-from mereo.geometry.conventions import Range
+from mereo.geometry.conventions import GridShape, Range
 from mereo.geometry.transforms import Corners, Points, Vector, unit_rows
 
 LATTICE_LIMIT = 1 / 2.48
@@ -189,7 +189,7 @@ class FreeFormLattice:
             )
 
     @classmethod
-    def sample(cls, rng: Generator, bounds: Corners, cells: tuple[int, int, int], strength: float) -> "FreeFormLattice":
+    def sample(cls, rng: Generator, bounds: Corners, cells: GridShape, strength: float) -> "FreeFormLattice":
         """Random control points over a box of ``cells`` and one spacing around; ``strength`` in [0, 1) of the limit."""
         spacing = (bounds[1] - bounds[0]) / np.array(cells)
         shape = (cells[0] + 3, cells[1] + 3, cells[2] + 3, 3)

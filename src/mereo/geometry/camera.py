@@ -5,7 +5,7 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -59,7 +59,7 @@ class Camera:
     center_y_px: float
 
     def __post_init__(self) -> None:
-        size: tuple[Any, ...] = self.width, self.height
+        size = self.width, self.height
         if not all(isinstance(side, int | np.integer) and not isinstance(side, bool) and side > 0 for side in size):
             raise ValueError(
                 f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"

@@ -78,10 +78,10 @@ def _surfaces_in_cells(flat: Float[ndarray, "n 2"], distance: Values, cell: floa
     index = np.floor(flat / cell).astype(np.int64)
     key = index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
     order = np.lexsort((distance, key))
-    starts = np.ones(len(flat), dtype=bool)
+    starts = np.ones(len(flat), bool)
     gap = np.diff(distance[order]) > STEEPEST * cell * distance[order][:-1]
     starts[1:] = (np.diff(key[order]) != 0) | gap
-    group = np.empty(len(flat), dtype=np.int64)
+    group = np.empty(len(flat), np.int64)
     group[order] = np.cumsum(starts) - 1
     return group
 
@@ -120,16 +120,16 @@ def farthest_point_order(points: Real[ndarray, "n 3"], count: int) -> Subset:
     """
     m = min(count, len(points))
     if m <= 0:
-        return np.empty(0, dtype=np.int64)
+        return np.empty(0, np.int64)
     rank = np.lexsort(points.T[::-1])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     # about the middle, so that single precision is spent on the shape and not on where it is
-    xyz = np.ascontiguousarray((points[rank] - middle).T, dtype=np.float32)
+    xyz = np.ascontiguousarray((points[rank] - middle).T, np.float32)
     current = int(np.add.reduce(xyz * xyz, axis=0).argmax())
     # buffers are reused and every operation is one pass, because m passes over n points dominate
-    order = np.empty(m, dtype=np.int64)
+    order = np.empty(m, np.int64)
     difference, square = np.empty_like(xyz), np.empty_like(xyz[0])
-    distance = np.full(xyz.shape[1], np.inf, dtype=np.float32)
+    distance = np.full(xyz.shape[1], np.inf, np.float32)
     for i in range(m):
         order[i] = current
         np.subtract(xyz, xyz[:, current : current + 1], out=difference)

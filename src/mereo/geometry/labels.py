@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.mesh import Color
+from mereo.geometry.conventions import Names
+from mereo.geometry.mesh import SegmentColors
 from mereo.geometry.transforms import Labels, PointArray, Points, Values, Vector
 
 GridLabels = UInt8[ndarray, "x y z"]
@@ -36,7 +37,7 @@ class LabelGrid:
     labels: GridLabels
     origin: Vector
     spacing: Vector
-    names: tuple[str, ...]
+    names: Names
 
     def __repr__(self) -> str:
         voxels = " x ".join(map(str, self.labels.shape))
@@ -54,7 +55,7 @@ class LabelGrid:
     def touched_sides(self) -> Bool[ndarray, "2 3"]:
         """Whether a segment reaches the grid's lower and upper border along x, y, z."""
         ends = [[np.take(self.labels, end, axis=axis).any() for axis in range(3)] for end in (0, -1)]
-        return np.array(ends, dtype=bool)
+        return np.array(ends, bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +77,8 @@ class SegmentedCloud:
     labels: Labels
     confidence: Values
     occupancy: Values
-    names: tuple[str, ...]
-    colors: tuple[Color, ...]
+    names: Names
+    colors: SegmentColors
 
     def __post_init__(self) -> None:
         count, *others = map(len, (self.points, self.labels, self.confidence, self.occupancy))

@@ -9,6 +9,7 @@ from numpy import ndarray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from mereo.geometry.conventions import WholeNumbers
 from mereo.geometry.labels import VoxelMask
 from mereo.geometry.mesh import AnyFaces
 from mereo.geometry.transforms import Flags, Points
@@ -82,13 +83,13 @@ def zero_surface(field: Float[ndarray, "x y z"]) -> tuple[Points, AnyFaces]:
     return middle // 2 + middle % 2 * (low / (low - high))[:, None], rows.reshape(-1, 3)
 
 
-def _turned(cells: Int[ndarray, "c 3"], positive: Bool[ndarray, "c 8"], shape: tuple[int, ...]) -> Flags:
+def _turned(cells: Int[ndarray, "c 3"], positive: Bool[ndarray, "c 8"], shape: WholeNumbers) -> Flags:
     """Whether each cell is taken for its negative, which cuts corners off where this joins them.
 
     Where two cells share a side on which opposite corners are alike, both are; else the surface would be open there.
     So are all cells that hang together in this way, by the sign at the first of them.
     """
-    row_of = np.zeros(shape, dtype=np.int64)
+    row_of = np.zeros(shape, np.int64)
     row_of[tuple(cells.T)] = np.arange(len(cells))
     links = list[ndarray]()
     for step, side in zip(np.eye(3, dtype=int), FAR_SIDES, strict=True):

@@ -16,6 +16,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
+from mereo.geometry.conventions import Names, Pair
 from mereo.geometry.read_only import read_only_view
 from mereo.geometry.transforms import (
     AnyPoints,
@@ -46,10 +47,19 @@ Elements = Int[ndarray, "m 4"]
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
 
+SegmentColors = tuple[Color, ...]
+"""Colour of each segment, in label order."""
+
+Nested = tuple[tuple[str, str], ...]
+"""Pairs of names of segments, the inner one first."""
+
+AnyMesh = tuple[AnyPoints, AnyFaces]
+"""Vertices and faces."""
+
 Colors = UInt8[ndarray, "n 3"]
 """A colour for each row of the axis ``n``."""
 
-PALETTE: tuple[Color, ...] = (
+PALETTE: SegmentColors = (
     (86, 180, 233),
     (230, 159, 0),
     (0, 158, 115),
@@ -102,10 +112,10 @@ class Segment:
     @property
     def volume(self) -> float:
         """Signed volume (divergence theorem); negative when the faces are inside out."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        a, b, c = face_corners(self.vertices, self.faces)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
-    def edge_imbalance(self) -> tuple[int, int]:
+    def edge_imbalance(self) -> Pair:
         """Numbers of open and of misoriented edges: both zero exactly when the mesh is closed and oriented alike."""
         return edge_imbalance(self.faces)
 
@@ -122,7 +132,7 @@ class SegmentedMesh:
     """
 
     segments: tuple[Segment, ...]
-    nested: tuple[tuple[str, str], ...] = ()
+    nested: Nested = ()
 
     def __post_init__(self) -> None:
         names = [segment.name for segment in self.segments]
@@ -151,12 +161,12 @@ class SegmentedMesh:
         return f"SegmentedMesh({counted(len(self.segments), 'segment')}: {listed(self.names)}; {faces}, {size})"
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the segments, in label order."""
         return tuple(segment.name for segment in self.segments)
 
     @property
-    def colors(self) -> tuple[Color, ...]:
+    def colors(self) -> SegmentColors:
         """Colours of the segments, in label order."""
         return tuple(segment.color for segment in self.segments)
 
@@ -167,7 +177,7 @@ class SegmentedMesh:
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
     @property
-    def nesting(self) -> tuple[tuple[int, int], ...]:
+    def nesting(self) -> tuple[Pair, ...]:
         """Pairs (inner, outer) of segments' indices, with what follows: a in b and b in c puts a in c."""
         index = {name: i for i, name in enumerate(self.names)}
         pairs = {(index[inner], index[outer]) for inner, outer in self.nested}
@@ -256,7 +266,7 @@ def edge_uses(
     return np.stack(np.divmod(keys, size), axis=1), uses, unbalanced
 
 
-def edge_imbalance(faces: Faces) -> tuple[int, int]:
+def edge_imbalance(faces: Faces) -> Pair:
     """Numbers of open and of misoriented edges: both zero exactly when a mesh is closed and oriented alike."""
     _, uses, unbalanced = edge_uses(faces)
     return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
@@ -264,7 +274,7 @@ def edge_imbalance(faces: Faces) -> tuple[int, int]:
 
 def three_cornered(faces: Faces) -> Bool[ndarray, " f"]:
     """Which faces have three different vertices."""
-    return np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    return (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 
 def with_used_vertices(
@@ -280,9 +290,14 @@ def palette_color(index: int) -> Color:
     return PALETTE[index % len(PALETTE)]
 
 
+def face_corners(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, ...]:
+    """First, second and third corner of each face."""
+    return tuple(vertices[faces[:, k]] for k in range(3))
+
+
 def area_vectors(vertices: Vertices, faces: Faces) -> Float[ndarray, "f 3"]:
     """Normals of faces, each as long as twice the face's area."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    a, b, c = face_corners(vertices, faces)
     return np.cross(b - a, c - a)
 
 
@@ -297,7 +312,7 @@ def surface_points(vertices: Vertices, faces: Faces, count: int) -> tuple[Points
 
     Vertices are not: a CAD program's are where a surface is round, none where it is flat.
     """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    a, b, c = face_corners(vertices, faces)
     area = np.cumsum(norm(area_vectors(vertices, faces), axis=1))
     face = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
     u, v = default_rng(0).random((2, count, 1))

@@ -13,9 +13,11 @@ from numpy import ndarray
 from numpy.linalg import norm, svd
 
 from mereo.geometry.brief import counted
+from mereo.geometry.conventions import Names, Pair
 from mereo.geometry.labels import VoxelMask
 from mereo.geometry.mesh import (
     AnyFaces,
+    AnyMesh,
     Segment,
     SegmentedMesh,
     area_vectors,
@@ -23,10 +25,11 @@ from mereo.geometry.mesh import (
     directed_edges,
     edge_imbalance,
     edge_uses,
+    face_corners,
     three_cornered,
 )
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import AnyPoints, Corners, Vector, longest_side
+from mereo.geometry.transforms import AnyPoints, Corners, Vector, box_of, longest_side
 
 MOST_BURIED, MOST_BACKWARDS, MOST_UNDECIDED = 5e-3, 0.05, 0.5
 """Shares of a surface that may lie within the segment, as lips and eyelids do (two rays are compared anyway), face
@@ -47,10 +50,10 @@ class Health(NamedTuple):
     are ``mendable``. ``notes`` do no harm, but change in a repair: fragments, faces without area.
     """
 
-    dirty: tuple[str, ...] = ()
-    hopeless: tuple[str, ...] = ()
+    dirty: Names = ()
+    hopeless: Names = ()
     mendable: bool = True
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
 
     @property
     def sound(self) -> bool:
@@ -161,7 +164,7 @@ def _wrong_edges(vertices: AnyPoints, faces: AnyFaces, unit: str) -> tuple[int, 
     return len(rim), faults
 
 
-def _notes(vertices: AnyPoints, faces: AnyFaces, surface: "_FrontWinding", unit: str) -> tuple[str, ...]:
+def _notes(vertices: AnyPoints, faces: AnyFaces, surface: "_FrontWinding", unit: str) -> Names:
     notes = []
     stray, what = fragments(vertices, faces, unit)
     if stray.any():
@@ -204,12 +207,12 @@ class _FrontWinding(NamedTuple):
 
 def _front_winding(vertices: AnyPoints, faces: AnyFaces) -> _FrontWinding:
     corners = vertices[np.unique(faces)]
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    low, high = box_of(corners)
     vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(norm(high - low))
     normal = area_vectors(vertices, faces)
     area = norm(normal, axis=1)
     proper = area > 1e-12
-    a, b, c = (vertices[faces[proper, k]] for k in range(3))
+    a, b, c = face_corners(vertices, faces[proper])
     middle = (a + b + c) / 3
     # a ten-thousandth of the box's diagonal before each face; libigl's winding number is in single precision
     front = middle + 1e-4 * normal[proper] / area[proper, None]
@@ -272,13 +275,13 @@ def solid_of(vertices: AnyPoints, faces: AnyFaces) -> manifold3d.Manifold:
     return solid
 
 
-def mesh_of(solid: manifold3d.Manifold) -> tuple[AnyPoints, AnyFaces]:
+def mesh_of(solid: manifold3d.Manifold) -> AnyMesh:
     """Vertices and faces of a solid."""
     mesh = solid.to_mesh64()
-    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
+    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, np.int64)
 
 
-def united(pieces: Sequence[Segment]) -> tuple[AnyPoints, AnyFaces]:
+def united(pieces: Sequence[Segment]) -> AnyMesh:
     """Union of pieces, as vertices and faces, where each is a solid that faces outwards; else all of their faces."""
     if len(pieces) == 1:
         return pieces[0].vertices, pieces[0].faces
@@ -315,7 +318,7 @@ class Overlap(NamedTuple):
 
 
 def overlaps(
-    mesh: SegmentedMesh, tolerance: float = TOLERANCE, among: Collection[tuple[int, int]] | None = None
+    mesh: SegmentedMesh, tolerance: float = TOLERANCE, among: Collection[Pair] | None = None
 ) -> tuple[Overlap, ...]:
     """Pairs of segments that share more than ``tolerance`` of the smaller one, or nest with as much outside.
 

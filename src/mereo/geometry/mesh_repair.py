@@ -17,15 +17,18 @@ from numpy.linalg import norm
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
+from mereo.geometry.conventions import Names
 from mereo.geometry.marching_cubes import CORNERS, changing_cells, nodes_of, zero_surface
 from mereo.geometry.mesh import (
     AnyFaces,
+    AnyMesh,
     Segment,
     SegmentedMesh,
     area_vectors,
     connected,
     directed_edges,
     edge_imbalance,
+    face_corners,
     surface_points,
     three_cornered,
     with_used_vertices,
@@ -54,7 +57,7 @@ class Repair(NamedTuple):
     """
 
     segment: Segment
-    changes: tuple[str, ...]
+    changes: Names
     kept: Segment
 
 
@@ -68,7 +71,7 @@ def repaired(segment: Segment, unit: str = "") -> Repair:
         return Repair(segment, (), segment)
     if not health.mendable:
         raise ValueError(lost)
-    changes: list[str] = []
+    changes = list[str]()
     vertices, faces = kept = segment.vertices, segment.faces
     for step in (_drop_unusable, _merge_near, _drop_fragments, _orient, _fill_holes, _unite, _remesh):
         if changes and len(faces) and examine(replace(segment, vertices=vertices, faces=faces)).sound:
@@ -113,7 +116,7 @@ def _merge_near(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     return *best, change
 
 
-def _merged(vertices: AnyPoints, faces: AnyFaces, distance: float) -> tuple[AnyPoints, AnyFaces]:
+def _merged(vertices: AnyPoints, faces: AnyFaces, distance: float) -> AnyMesh:
     rim = np.unique(open_edges(vertices, faces))
     pairs = rim[cKDTree(vertices[rim]).query_pairs(distance, output_type="ndarray")].reshape(-1, 2)
     group = connected(pairs, len(vertices))
@@ -219,7 +222,7 @@ class _Body:
     """A mesh in cells: which places it encloses, and how far they are from it."""
 
     def __init__(self, vertices: AnyPoints, faces: AnyFaces) -> None:
-        self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
+        self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
         self._closed = edge_imbalance(faces) == (0, 0)
         self._tree = search_tree(self.vertices, self.faces)
 
@@ -435,7 +438,7 @@ def farthest(before: Segment, after: Segment) -> tuple[Reach, Reach]:
     length = float(norm(np.ptp(before.vertices, axis=0)))
     places, normals, _ = body.samples(np.arange(len(before.faces)), length / 300)
     way = other.distance(places)
-    reach: dict[bool, Reach] = {}
+    reach = dict[bool, Reach]()
     # the farthest first, for winding numbers of all places would take longer than their distances
     for rows in np.array_split(np.argsort(-way, kind="stable"), 64):
         outer = rows[~body.inside(places[rows] + 1e-4 * length * normals[rows])]
@@ -455,7 +458,7 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
     What sticks out of a segment that it is nested in is cut off. All segments must be solids.
     """
     segments = {segment.name: segment for segment in mesh.segments}
-    changes: dict[str, list[str]] = {}
+    changes = dict[str, list[str]]()
     for overlap in overlaps(mesh):
         pair = segments[overlap.small], segments[overlap.large]
         small, large = (solid_of(segment.vertices, segment.faces) for segment in pair)
@@ -475,7 +478,7 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
 def _without_flecks(vertices: AnyPoints, faces: AnyFaces) -> Step:
     """Mesh without pieces of hardly any volume: Booleans of meshes that nearly touch leave them."""
     piece = pieces(faces, len(vertices))
-    a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
+    a, b, c = face_corners(vertices - vertices.mean(axis=0), faces)
     volume = np.abs(np.bincount(piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c))))
     kept = volume > 1e-5 * volume.max()
     share = 100 * volume[~kept].sum() / volume.sum()
@@ -486,7 +489,7 @@ def _without_flecks(vertices: AnyPoints, faces: AnyFaces) -> Step:
 # --- the largest piece, and holes -------------------------------------------------------------------------------------
 
 
-def largest_piece(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, AnyFaces]:
+def largest_piece(vertices: AnyPoints, faces: AnyFaces) -> AnyMesh:
     """Piece of the most faces; unused vertices are left out."""
     piece = pieces(faces, len(vertices))
     return with_used_vertices(vertices, faces[piece == np.bincount(piece).argmax()])
@@ -499,7 +502,7 @@ def open_edges(vertices: AnyPoints, faces: AnyFaces) -> Int[ndarray, "_ 2"]:
     return directed[~np.isin(forth, back)]
 
 
-def close_holes(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, AnyFaces]:
+def close_holes(vertices: AnyPoints, faces: AnyFaces) -> AnyMesh:
     """Mesh whose open loops are closed by fans around the mean of their vertices; a closed mesh stays as it is."""
     rim = open_edges(vertices, faces)
     if len(rim) == 0:

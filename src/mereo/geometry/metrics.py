@@ -100,7 +100,7 @@ def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
     spacing = (high - low) / cells
     origin = low + spacing / 2
     x, y, z = (origin[axis] + np.arange(cells) * spacing[axis] for axis in range(3))
-    kept = np.zeros((cells, cells, cells), dtype=bool)
+    kept = np.zeros((cells, cells, cells), bool)
     for segment in mesh.segments:
         first, last = segment.bounds
         margin = 0.25 * (last - first)  # on each side: 50 % in all, as in the paper
@@ -121,4 +121,4 @@ def labels_on(surfaces: SegmentedMesh, grid: LabelGrid) -> GridLabels:
     if not present:
         return np.zeros_like(grid.labels)
     labels = label_grid(SegmentedMesh(tuple(surfaces.segments[number] for number in present)), *grid.axes())
-    return np.array([0, *(number + 1 for number in present)], dtype=np.uint8)[labels]
+    return np.array([0, *(number + 1 for number in present)], np.uint8)[labels]

@@ -9,11 +9,12 @@ from jaxtyping import Float, Float32, UInt8
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
+from mereo.geometry.conventions import WholeNumbers
 from mereo.geometry.labels import LabelGrid
-from mereo.geometry.mesh import Color, Colors
+from mereo.geometry.mesh import Color, Colors, SegmentColors
 from mereo.geometry.transforms import Points, Values
 
-STOPS: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
+STOPS: SegmentColors = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
 """Colours from a radius of none to ``Radii.high``: pale is sure, dark red is not."""
 
 
@@ -32,7 +33,7 @@ class Radii:
     points: Float[ndarray, "m 3"]
     labels: UInt8[ndarray, " m"]
     values: Float[ndarray, " m"]
-    counts: tuple[int, ...]
+    counts: WholeNumbers
     calibrated: bool
 
     @property
@@ -64,12 +65,11 @@ class Radii:
         tree, values = self._trees[label]
         distance, near = tree.query(places, k=range(1, min(4, len(values)) + 1))  # a radius is smooth
         weight = 1.0 / np.maximum(distance, 1e-12 * max(1.0, float(np.abs(self.points).max()))) ** 2
-        result: ndarray = (weight * values[near]).sum(axis=1) / weight.sum(axis=1)
-        return result
+        return (weight * values[near]).sum(axis=1) / weight.sum(axis=1)
 
     def on_grid(self, grid: LabelGrid) -> Float32[ndarray, "x y z"]:
         """Radii at the centres of the voxels of each segment, to three digits; NaN in empty space."""
-        result = np.full(grid.labels.shape, np.nan, dtype=np.float32)
+        result = np.full(grid.labels.shape, np.nan, np.float32)
         for label in self._trees:
             index = np.argwhere(grid.labels == label)
             if len(index):
@@ -86,8 +86,7 @@ def describe_level(calibrated: bool) -> str:
 def rounded_to(values: Values, digits: int) -> Values:
     """Positive numbers to this many decimal digits."""
     unit = 10.0 ** (np.floor(np.log10(np.maximum(values, np.finfo(np.float64).tiny))) - digits + 1)
-    result: ndarray = np.round(values / unit) * unit
-    return result
+    return np.round(values / unit) * unit
 
 
 def between_stops(shares: Values, stops: Sequence[Color]) -> Points:
@@ -96,5 +95,5 @@ def between_stops(shares: Values, stops: Sequence[Color]) -> Points:
     What lies below 0 or above 1 has the colour of that end; NaN stays NaN.
     """
     places = np.clip(shares, 0.0, 1.0) * (len(stops) - 1)
-    columns = np.asarray(stops, dtype=float).T
+    columns = np.asarray(stops, float).T
     return np.stack([np.interp(places, np.arange(len(stops)), column) for column in columns], axis=1)

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 from scipy.sparse import csr_array
 
-from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_vectors
+from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_vectors, face_corners
 from mereo.geometry.read_only import read_only
 from mereo.geometry.transforms import Flags, Indices, Labels, Points, Subset, Values, Vector, unit_rows
 
@@ -94,8 +94,8 @@ class _Solid:
     """One closed segment with its search structures, built on first use."""
 
     def __init__(self, segment: Segment) -> None:
-        self.vertices = np.ascontiguousarray(segment.vertices, dtype=float)
-        self.faces = np.ascontiguousarray(segment.faces, dtype=np.int64)
+        self.vertices = np.ascontiguousarray(segment.vertices, float)
+        self.faces = np.ascontiguousarray(segment.faces, np.int64)
         self.is_solid = segment.solid
         self.low, self.high = segment.bounds
 
@@ -110,7 +110,7 @@ class _Solid:
 
     def in_box(self, points: Points) -> Flags:
         """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
-        result = np.ones(len(points), dtype=bool)
+        result = np.ones(len(points), bool)
         for axis in range(3):  # several times faster than all three at once
             result &= (points[:, axis] > self.low[axis]) & (points[:, axis] < self.high[axis])
         return result
@@ -118,7 +118,7 @@ class _Solid:
     def holds(self, points: Points) -> Flags:
         """Whether points, already known to lie in the box, are inside."""
         if len(points) == 0:
-            return np.zeros(0, dtype=bool)
+            return np.zeros(0, bool)
         if not self.is_solid:
             return igl.fast_winding_number(self.vertices, self.faces, points) > 0.5
         first, second = self._behind_first_hit(points)
@@ -201,7 +201,7 @@ class Solids:
         pocket of winding number -1 from behind, and a point outside then counts as inside: of the built-in scenes six
         in 10,000 within 0.1 units of the skull's cranium.
         """
-        labels = np.zeros(len(points), dtype=np.uint8)
+        labels = np.zeros(len(points), np.uint8)
         for index, solid in enumerate(self._solids):
             candidates = np.flatnonzero((labels == 0) & solid.in_box(points))
             labels[candidates[solid.holds(points[candidates])]] = index + 1
@@ -218,7 +218,7 @@ class Solids:
         bounds = np.stack([np.einsum("ij,ij->i", offset, offset) for offset in outside])
         likely = bounds.argmin(axis=0)
         squared, place = np.full(len(points), np.inf), np.empty_like(points)
-        face, owner = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
+        face, owner = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
         first_faces = np.cumsum([0, *(len(solid.faces) for solid in self._solids)])
         # first the segment whose box is nearest, then those whose boxes are nearer than what it gave: one to two each
         for again in (False, True):
@@ -271,7 +271,7 @@ def label_grid(
     Signed crossings are counted along columns instead of testing every node, see ``winding_number``: a closed segment
     has no cracks, and a node exactly on a surface has the label of the node just above it.
     """
-    labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
+    labels = np.zeros((len(x), len(y), len(z)), np.uint8)
     for index, segment in enumerate(mesh.segments):
         box = tuple(
             slice(int(np.searchsorted(axis, low)), int(np.searchsorted(axis, high, "right")))
@@ -310,7 +310,7 @@ def winding_grid(
     heights, weights = corners[triangle[hit]][..., 2], weights[hit]
     height = (weights * heights).sum(axis=1) / weights.sum(axis=1)
     height = np.clip(height, heights.min(axis=1), heights.max(axis=1))  # so that level faces stay level
-    crossings = np.zeros((len(x), len(y), len(z) + 1), dtype=np.int32)
+    crossings = np.zeros((len(x), len(y), len(z) + 1), np.int32)
     np.add.at(crossings, (i[hit], j[hit], np.searchsorted(z, height)), step)
     return crossings.cumsum(axis=2)[..., :-1] > 0
 
@@ -327,7 +327,7 @@ def _edge_sides(
     is moved by (e, e^2), e infinitely small (Edelsbrunner and Muecke's simulation of simplicity): then vertices too
     are on one side of everything.
     """
-    weights, left = np.empty((len(x), 3)), np.empty((len(x), 3), dtype=bool)
+    weights, left = np.empty((len(x), 3)), np.empty((len(x), 3), bool)
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
         swap = ids[:, a] > ids[:, b]
@@ -362,15 +362,15 @@ def owned_centroids(mesh: SegmentedMesh) -> Float[ndarray, "s 3"]:
     volumes, moments = mesh.owned_volumes, np.stack([_first_moment(segment) for segment in mesh.segments])
     for outer in range(len(moments)):  # the inner ones come first and are done
         moments[outer] -= sum((moments[inner] for inner, other in mesh.nesting if other == outer), np.zeros(3))
-    return np.asarray(moments / volumes[:, None])
+    return moments / volumes[:, None]
 
 
 def _first_moment(segment: Segment) -> Vector:
     """Volume times centroid of a closed mesh (divergence theorem), by tetrahedra with one corner at its middle."""
     middle = segment.vertices.mean(axis=0)
-    a, b, c = (segment.vertices[segment.faces[:, i]] - middle for i in range(3))
+    a, b, c = face_corners(segment.vertices - middle, segment.faces)
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-    return np.asarray((volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle)
+    return (volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle
 
 
 def owned_gradients(mesh: SegmentedMesh) -> Float[ndarray, "s 4 v 3"]:
@@ -405,5 +405,5 @@ def _gradients(segment: Segment, origin: Vector) -> Float[ndarray, "4 v 3"]:
     collect = csr_array(
         (np.ones(len(columns)), (segment.faces.ravel(), columns)), (len(segment.vertices), len(columns))
     )
-    gradients: ndarray = (collect @ each).reshape(-1, 4, 3)
+    gradients = (collect @ each).reshape(-1, 4, 3)
     return gradients.transpose(1, 0, 2)

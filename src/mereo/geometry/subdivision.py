@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 from numpy import ndarray
 from numpy.linalg import norm
 
-from mereo.geometry.mesh import AnyFaces, ChangedMesh, Faces, Segment, Vertices, connected, directed_edges
+from mereo.geometry.mesh import AnyFaces, ChangedMesh, Faces, Segment, Vertices, connected, directed_edges, face_corners
 from mereo.geometry.transforms import Indices
 
 TooLong = Callable[[Float[ndarray, "e 2 3"]], Bool[ndarray, " e"]]
@@ -41,12 +41,12 @@ def split_edges(vertices: Vertices, faces: Faces, too_long: TooLong, most: int) 
     ``TooManyFaces`` where that takes more than ``most``.
     """
     faces = faces.astype(np.int64)
-    short: Int[ndarray, " k"] = np.empty(0, dtype=np.int64)
+    short = np.empty(0, np.int64)
     while True:
         edges, edge_of = _edges(faces)
         keys = edges[:, 0] << 32 | edges[:, 1]
         new = ~np.isin(keys, short)
-        long = np.zeros(len(edges), dtype=bool)
+        long = np.zeros(len(edges), bool)
         long[new] = too_long(vertices[edges[new]])
         if not long.any():
             return vertices, faces
@@ -92,8 +92,8 @@ CREASE_DEG = 30.0
 """Angle between the normals of two neighbouring faces above which the edge between them is a crease."""
 
 
-def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[Segment, Indices]:
-    """The same surface, its vertices split where faces meet at a crease: normals are farther apart than ``angle_deg``.
+def split_at_creases(segment: Segment) -> tuple[Segment, Indices]:
+    """The same surface, its vertices split where faces meet at a crease: normals are farther apart than ``CREASE_DEG``.
 
     A vertex is split into as many as there are groups of faces around it between which only creases lie; where a crease
     ends within a smooth surface there is one such group, and it stays one vertex. Faces without area have no normal and
@@ -112,10 +112,10 @@ def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[S
     cosine = np.einsum("ni,ni->n", normals[first], normals[second])
     has_normals = ~(is_flat[first] | is_flat[second])
     # a cylinder of twelve sides has exactly 30 degrees at each edge, up to rounding
-    is_crease = has_normals & (cosine < np.cos(np.deg2rad(angle_deg + 0.01)))
+    is_crease = has_normals & (cosine < np.cos(np.deg2rad(CREASE_DEG + 0.01)))
     if not is_crease.any():
         return segment, same
-    on_crease = np.zeros(count, dtype=bool)
+    on_crease = np.zeros(count, bool)
     on_crease[edge[is_crease]] = True
     is_smooth = has_normals & ~is_crease
     group = _groups(faces, (first[is_smooth], second[is_smooth], edge[is_smooth]), on_crease)
@@ -132,7 +132,7 @@ def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[S
 
 def _face_normals(segment: Segment) -> Float[ndarray, "f 3"]:
     """Unit normals of the faces; zero for those without area."""
-    a, b, c = (segment.vertices[segment.faces[:, k]].astype(float) for k in range(3))
+    a, b, c = face_corners(segment.vertices.astype(float), segment.faces)
     normals = np.cross(b - a, c - a)
     area = norm(normals, axis=1, keepdims=True)
     longest = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)[:, None]

@@ -57,7 +57,7 @@ def surface_patches(points: Points) -> tuple[Indices, Flags]:
     rows = thin_to_grid(points, MAX_POINTS)
     places, place = np.unique(points[rows], axis=0, return_inverse=True)
     if len(places) <= NEIGHBORS + 1:
-        return np.zeros(len(points), dtype=np.int64), np.ones(len(points), dtype=bool)
+        return np.zeros(len(points), np.int64), np.ones(len(points), bool)
     patch, inner, tall = _patches(places)
     surface = np.bincount(patch, inner)[patch] > 0
     if not surface.any():
@@ -98,7 +98,7 @@ def without_strays(points: Points) -> Flags:
     """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer."""
     keep = surface_points(points)
     if keep.all() or stretch(points, keep) <= STRETCH:
-        return np.ones(len(points), dtype=bool)
+        return np.ones(len(points), bool)
     return keep
 
 
@@ -183,8 +183,7 @@ def _fit_patches(
 ) -> Float[ndarray, "n 6"]:
     """Coefficients of each point's patch by least squares; ``weighted`` are the neighbours' values times weights."""
     normal = np.einsum("nki,nk,nkj->nij", terms, weight, terms) + np.diag(ridge)
-    fitted: ndarray = solve(normal, np.einsum("nki,nk->ni", terms, weighted)[..., None])[..., 0]
-    return fitted
+    return solve(normal, np.einsum("nki,nk->ni", terms, weighted)[..., None])[..., 0]
 
 
 def _quadratic(places: Points, axis: Points, neighbor: Int[ndarray, "n k"], radius: float) -> Float[ndarray, "n k 6"]:

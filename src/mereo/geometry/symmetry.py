@@ -16,6 +16,7 @@ from numpy.linalg import eigh, lstsq, norm
 from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import SegmentedMesh, area_vectors
 from mereo.geometry.solids import Solids, search_tree
 from mereo.geometry.transforms import Matrix, Points, Transform, Vector, longest_side, transform_points
@@ -67,7 +68,7 @@ class Symmetry:
         """Whether each segment comes to lie on itself, so that the pose alone is not determined."""
         return self.lands_on == tuple(range(len(self.lands_on)))
 
-    def describe(self, names: tuple[str, ...]) -> str:
+    def describe(self, names: Names) -> str:
         """Make a sentence of what no camera tells, for segments of these names."""
         how = "by any angle" if self.angle is None else f"by {np.rad2deg(self.angle):.0f} degrees"
         text = f"the object looks the same turned {'in any way' if self.axis is None else how + _about_axis(self.axis)}"
@@ -119,7 +120,7 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
     return _settled(surface, center, np.concatenate([around[:, None] * main, np.pi * across]))
 
 
-def describe_symmetries(symmetries: Sequence[Symmetry], names: tuple[str, ...], of_segments: bool = False) -> list[str]:
+def describe_symmetries(symmetries: Sequence[Symmetry], names: Names, of_segments: bool = False) -> list[str]:
     """Make one sentence for each thing that no camera tells: of symmetries with the same effect the first.
 
     With ``of_segments`` those are left out that turn each segment onto itself.
@@ -185,8 +186,7 @@ class _Surface:
 
     @property
     def _few(self) -> Float[ndarray, "f 3"]:
-        few: ndarray = self.points[self.visible[:: max(1, len(self.visible) // FEW)]]
-        return few
+        return self.points[self.visible[:: max(1, len(self.visible) // FEW)]]
 
     def is_kept(self, turn: Transform) -> bool:
         """Whether the turned visible surface lies on the surface."""
@@ -249,8 +249,7 @@ def _axis_of(turn: Transform) -> Vector:
 def _fixed_point(turns: list[Transform]) -> Vector:
     """Find the point that turns move least; of those of one axis the nearest to the origin."""
     rows = np.concatenate([np.eye(3) - turn[:3, :3] for turn in turns])
-    point: ndarray = lstsq(rows, np.concatenate([turn[:3, 3] for turn in turns]), rcond=1e-6)[0]
-    return point
+    return lstsq(rows, np.concatenate([turn[:3, 3] for turn in turns]), rcond=1e-6)[0]
 
 
 def _angle(rotation: Matrix) -> float:

@@ -71,12 +71,12 @@ def is_rigid(transform: Transform, tolerance: float = 1e-6) -> bool:
 
 def checked_pose(pose: ArrayLike) -> Transform:
     """A rigid pose as numbers, of a few printed digits or more; ``ValueError`` for what is none."""
-    entries: ndarray = np.asarray(pose, dtype=object)  # of which rows may differ in length
+    entries = np.asarray(pose, object)  # of which rows may differ in length
     what = f"of the shape {entries.shape}"
     if entries.shape == (4, 4):
         what = "not of real numbers"
         if all(isinstance(entry, Real) for entry in entries.flat):
-            T: ndarray = entries.astype(float)
+            T = entries.astype(float)
             if is_rigid(T, 1e-3) and np.abs(T).max() <= LARGEST:
                 return T
             what = str(np.round(T, 3).tolist())
@@ -111,6 +111,11 @@ def look_at(eye: Vector, target: Vector, up: Vector, roll_rad: float = 0.0) -> T
     y = np.cross(z, x)
     cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
+
+
+def box_of(points: AnyPoints) -> Corners:
+    """Box around points, parallel to the axes."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def longest_side(points: AnyPoints) -> float:
@@ -172,7 +177,7 @@ class Normalizer:
         """Normalizer of a cloud, the paper's t and s. Raises ``ValueError`` when the cloud has no extent."""
         if len(points) == 0:
             raise ValueError("the point cloud is empty; it needs points on the object: check the mask and the units")
-        low, high = points.min(axis=0), points.max(axis=0)
+        low, high = box_of(points)
         half = float((high - low).max()) / 2
         if not half > 0:
             raise ValueError("all points coincide; the cloud needs an extent: check the file's columns and units")

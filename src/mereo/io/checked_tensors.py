@@ -7,13 +7,13 @@ Files of earlier versions have none and are taken as they are.
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from numpy import ndarray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from mereo.geometry.conventions import Facts
 from mereo.io.atomic_files import JsonObject
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, StorageError
@@ -23,7 +23,7 @@ HEADER, CHECKSUM = "mereo", "sha256"
 Tensors = Mapping[str, ndarray]
 
 
-def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
+def pack_tensors(tensors: Tensors, facts: Facts) -> bytes:
     """Content of a file with these tensors, and facts that JSON knows."""
     whole = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     return save(whole, metadata={HEADER: json.dumps({**facts, CHECKSUM: _digest(whole, facts)})})
@@ -51,7 +51,7 @@ def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str
         tensors = load(content)
         # 8 bytes with the length of a JSON object, which follows
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        facts: JsonObject = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
+        facts = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
         expected = facts.pop(CHECKSUM, None)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(reason(error)) from None
@@ -84,7 +84,7 @@ def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[st
             raise ValueError(f"its tensor {name!r} has the shape {list(shape)}")
 
 
-def _digest(tensors: Tensors, facts: Mapping[str, Any]) -> str:
+def _digest(tensors: Tensors, facts: Facts) -> str:
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype.str} {value.shape}".encode())

@@ -179,8 +179,8 @@ Owners = list[tuple[str, str, str]]
 
 def _obj_parts(path: Path) -> list[Part]:
     """Parts of an OBJ file, parsed here because trimesh gives them in no stable order. Polygons become fans."""
-    positions: list[list[float]] = []
-    faces: list[list[int]] = []
+    positions = list[list[float]]()
+    faces = list[list[int]]()
     owners: Owners = []
     name = {"o": "", "g": "", "usemtl": "", "mtllib": ""}
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
@@ -196,7 +196,7 @@ def _obj_parts(path: Path) -> list[Part]:
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
             owners += [(name["o"], name["g"], name["usemtl"])] * (len(corners) - 2)
     colors = _material_colors(path, name["mtllib"])
-    vertices, triangles = np.asarray(positions), np.asarray(faces, dtype=np.int64)
+    vertices, triangles = np.asarray(positions), np.asarray(faces, np.int64)
     if materials := _material_parts(vertices, triangles, owners, path):
         owners = materials
     return _split_parts(vertices, triangles, owners, colors, path.stem)
@@ -305,7 +305,7 @@ def _scene_parts(path: Path) -> list[Part]:
 def _load_scene(path: Path) -> Any:
     """trimesh's scene of a file; no other file is opened but the buffers of glTF."""
     if path.suffix.lower() not in (".glb", ".gltf"):
-        strict: dict[str, Any] = {"ignore_broken": False} if path.suffix.lower() == ".dae" else {}
+        strict: JsonObject = {"ignore_broken": False} if path.suffix.lower() == ".dae" else {}
         return trimesh.load_scene(path, resolver={}, process=False, **strict)
     tree, buffers = _plain_gltf(path)
     return trimesh.load_scene(BytesIO(json.dumps(tree).encode()), "gltf", buffers, process=False)
@@ -350,8 +350,8 @@ def _in_frame(scene: Any, node: str, base: str) -> tuple[Vertices, Faces, Any]:
     """Vertices of a node in the frame of another one, its faces, and trimesh's geometry."""
     transform, key = scene.graph.get(node, frame_from=base)
     geometry = scene.geometry[key]
-    vertices = transform_points(transform, np.asarray(geometry.vertices, dtype=float))
-    faces = np.asarray(geometry.faces, dtype=np.int64)
+    vertices = transform_points(transform, np.asarray(geometry.vertices, float))
+    faces = np.asarray(geometry.faces, np.int64)
     if det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return vertices, faces, geometry
@@ -380,7 +380,7 @@ def merge_positions(vertices: Vertices, faces: Faces) -> ChangedMesh:
 def _distinct(rows: Float[ndarray, "v k"]) -> tuple[Int[ndarray, " w"], Int[ndarray, " v"]]:
     """First of each group of equal rows, in their order, and which of these each row is."""
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=np.int64)
+    rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return np.sort(first), rank[inverse.reshape(-1)]
 
@@ -536,7 +536,7 @@ def read_glb(path: AnyPath) -> GlbScene:
         scene = _load_scene(path)
         is_ours = VIEWER_ROOT in scene.graph.nodes
         base = VIEWER_ROOT if is_ours else scene.graph.base_frame
-        root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_ours else np.eye(4), dtype=float)[:3, :3]
+        root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_ours else np.eye(4), float)[:3, :3]
         nodes = _nodes_with_faces(scene)
         if not nodes:
             raise ValueError("it has no faces")
@@ -564,7 +564,7 @@ def _glb_part(
     return (
         Segment(name, color, vertices[kept], index[faces], solid=False),
         None if colors is None else colors[kept],
-        None if radii is None else np.asarray(radii, dtype=float).reshape(-1)[kept],
+        None if radii is None else np.asarray(radii, float).reshape(-1)[kept],
         isinstance(facts, dict) and facts.get("calibrated") is True,
     )
 
@@ -574,7 +574,7 @@ def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[ndarray, "v 3"] |
     visual, count = geometry.visual, len(geometry.vertices)
     material = getattr(visual, "material", None)
     factor = getattr(material, "baseColorFactor", None)
-    tint = np.ones(3) if factor is None else np.asarray(factor, dtype=float)[:3] / 255.0
+    tint = np.ones(3) if factor is None else np.asarray(factor, float)[:3] / 255.0
     each = None
     painted = getattr(visual, "vertex_attributes", {}).get("color")
     painted = visual.vertex_colors if painted is None and visual.kind == "vertex" else painted
@@ -601,7 +601,7 @@ def _screen(linear: Points) -> Colors:
 
 def _numbered(given: Sequence[str]) -> list[str]:
     """Names of which no two are the same: repeated ones are numbered."""
-    names: list[str] = []
+    names = list[str]()
     for name in given:
         tries = (name if n == 1 else f"{name} ({n})" for n in range(1, len(given) + 1))
         names.append(next(name for name in tries if name not in names))

@@ -72,7 +72,7 @@ def _with_normals(points: Points, source: Any) -> Rows:
     """Points, with the normals that an object of Open3D or trimesh has for each of them, if it has."""
     for name in ("normals", "vertex_normals"):
         with suppress(Exception):  # of what else has such a name
-            normals = np.asarray(getattr(source, name), dtype=float)
+            normals = np.asarray(getattr(source, name), float)
             if normals.shape == points.shape and np.isfinite(normals).all():
                 return np.hstack([points, normals])
     return points
@@ -275,7 +275,7 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
     """
     if isinstance(source, SegmentedMesh):
         return source
-    named: Any = parts_of_scene(source)
+    named = parts_of_scene(source)
     if not (is_named := isinstance(named, Mapping)):
         is_list = isinstance(source, list | tuple) and _triangles(source) is None
         named = dict(enumerate(source if is_list else [source]))

@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import Camera, DepthImage, PixelMask, PixelValues, PointCloud, Size
-from mereo.geometry.conventions import LARGEST
+from mereo.geometry.conventions import LARGEST, Names, WholeNumbers
 from mereo.geometry.mesh import with_normals
 from mereo.geometry.transforms import Points, Rows, Transform, checked_pose, rigid
 from mereo.io.errors import AnyPath, check_count, check_suffix, limited_memory, quiet, readable, without_output
@@ -88,7 +88,7 @@ def read_points(path: AnyPath) -> Rows:
         )
     check_suffix(path, CLOUD_READERS, "point cloud")
     with readable(path, "point cloud"):
-        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=float)
+        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), float)
 
 
 def valid_points(
@@ -199,13 +199,13 @@ def masked_depth(image: DepthImage, path: AnyPath, mask: PixelMask) -> DepthImag
 
 
 def usable_depth(
-    image: DepthImage, path: AnyPath, mask_path: AnyPath | None = None, mask_values: tuple[int, ...] = ()
+    image: DepthImage, path: AnyPath, mask_path: AnyPath | None = None, mask_values: WholeNumbers = ()
 ) -> DepthImage:
     """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does.
 
     ``mask_values`` are as in ``read_mask``.
     """
-    mask = np.ones(image.depth.shape, dtype=bool)
+    mask = np.ones(image.depth.shape, bool)
     if mask_path is None and np.size(mask_values):
         raise ValueError("--mask-value says which pixels of a mask are the object, and none is given: give --mask FILE")
     if mask_path is not None:
@@ -228,7 +228,7 @@ LOSSY = ("JPEG", "MPO", "JPEG2000", "WEBP")
 """Formats (as Pillow calls them) that may store other values than they were given."""
 
 
-def read_mask(path: AnyPath, size: Size | None = None, values: tuple[int, ...] = ()) -> PixelMask:
+def read_mask(path: AnyPath, size: Size | None = None, values: WholeNumbers = ()) -> PixelMask:
     """Pixels of an image that show the object.
 
     These are the opaque ones of an image with transparent parts; else those that are not 0, in any channel, or that
@@ -244,7 +244,7 @@ def read_mask(path: AnyPath, size: Size | None = None, values: tuple[int, ...] =
     return _chosen_pixels(layers, f"the mask {path}", size, values)
 
 
-def mask_of_image(image: Image.Image, size: Size | None = None, values: tuple[int, ...] = ()) -> PixelMask:
+def mask_of_image(image: Image.Image, size: Size | None = None, values: WholeNumbers = ()) -> PixelMask:
     """Pixels of an image in memory that show the object; takes the arguments of ``read_mask`` and raises as it does."""
     return _chosen_pixels(_mask_layers(image), "the mask", size, values)
 
@@ -260,7 +260,7 @@ def _mask_layers(image: Image.Image) -> MaskLayers:
     return image.format in LOSSY, opacity, shown, np.asarray(image) if image.mode == "P" else shown
 
 
-def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: tuple[int, ...]) -> PixelMask:
+def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: WholeNumbers) -> PixelMask:
     is_lossy, opacity, shown, stored = layers
     channels = stored.reshape(*stored.shape[:2], -1)
     ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
@@ -302,7 +302,7 @@ def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: tup
 # --- parsers of depth images: values as stored, integers or floats ----------------------------------------------------
 
 
-def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -> Image.Image:
+def open_image(source: Path | BytesIO, formats: Names | None = None) -> Image.Image:
     """Open an image of one of some formats, to be closed by the caller, and compare the checksums of a PNG."""
     with Image.open(source, formats=formats) as image:
         if image.format == "PNG":
@@ -314,7 +314,7 @@ def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -
 
 def in_memory(values: ndarray) -> ndarray:
     """Values that no longer lie in the file, with the machine's own order of bytes."""
-    return np.array(values, dtype=values.dtype.newbyteorder("="))
+    return np.array(values, values.dtype.newbyteorder("="))
 
 
 def _grey(path: Path) -> Raw:
@@ -350,7 +350,7 @@ def _npy(path: Path) -> Raw:
     array = np.load(path, allow_pickle=False)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"its type is {array.dtype}, not a number")
-    return np.asarray(array)
+    return array
 
 
 DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
@@ -374,12 +374,12 @@ def _ply_points(path: Path) -> Rows:
         raise ValueError("it has 0 vertices")
     loaded: Any = trimesh.load(path, file_type="ply", resolver={}, process=False)  # no textures
     check_count(count, len(loaded.vertices), "points")
-    vertices = np.asarray(loaded.vertices, dtype=float)
+    vertices = np.asarray(loaded.vertices, float)
     with suppress(LookupError, ValueError):  # which numpy raises for a name that it has not
         stated = loaded.metadata["_ply_raw"]["vertex"]["data"]
-        normals = np.stack([np.asarray(stated[name], dtype=float).reshape(-1) for name in ("nx", "ny", "nz")], 1)
+        normals = np.stack([np.asarray(stated[name], float).reshape(-1) for name in ("nx", "ny", "nz")], 1)
         return np.hstack([vertices, np.nan_to_num(normals, posinf=0.0, neginf=0.0)])
-    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64).reshape(-1, 3)
+    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
     return with_normals(vertices, faces) if len(faces) else vertices
 
 
@@ -516,7 +516,7 @@ def read_viewpoint(path: Path) -> Transform | None:
         return None
     with readable(path, "point cloud"), path.open("rb") as file:
         words = _pcd_parts(file.read(65536))[0].get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
-        numbers = np.array(words, dtype=float)
+        numbers = np.array(words, float)
         if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(norm(numbers[3:]) - 1.0) > 1e-2:
             raise ValueError(f"its VIEWPOINT is {' '.join(words)}, not x y z and a unit quaternion qw qx qy qz")
         pose = rigid(Rotation.from_quat(numbers[3:], scalar_first=True).as_matrix(), numbers[:3])

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import UInt16
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import Pair, WholeNumbers
 from mereo.io.config import InputConfig
 from mereo.io.errors import reason
 from mereo.io.extras import library
@@ -116,7 +117,7 @@ def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Ite
                     raise _silence(name, name in _serials(rs))
                 yield None
                 continue
-            image, camera = np.array(depth.get_data(), dtype=np.uint16), camera or _camera(depth, topic)
+            image, camera = np.array(depth.get_data(), np.uint16), camera or _camera(depth, topic)
             if image.shape != (camera.height, camera.width):
                 raise ValueError(resized(topic, image.shape[::-1], (camera.width, camera.height)))
             stamp = depth.get_frame_timestamp_domain(), depth.get_timestamp()
@@ -152,7 +153,7 @@ def _silence(name: str, is_connected: bool) -> OSError:
     )
 
 
-def resized(name: str, size: tuple[int, ...], before: tuple[int, int]) -> str:
+def resized(name: str, size: WholeNumbers, before: Pair) -> str:
     """Sentence on a frame whose size, (width, height) in pixels, is not that of the frames before it."""
     return (
         f"{name} has {size[0]} x {size[1]} pixels, and the frames before it had {before[0]} x {before[1]}; a stream "

@@ -19,7 +19,7 @@ from numpy import ndarray
 from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.conventions import LARGEST, Names, Range
+from mereo.geometry.conventions import LARGEST, Names, Range, Texts
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
 from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
@@ -74,7 +74,7 @@ class Robot:
 
     mesh: SegmentedMesh
     joints: tuple[RobotJoint, ...]
-    notes: tuple[str, ...]
+    notes: Names
 
 
 def is_robot(path: Path) -> bool:
@@ -304,7 +304,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
         for geom in geoms[is_taken] if is_taken.any() else geoms:
             T = rigid(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom] - place[names[body]])
             shapes += [_Shape(names[body], T, solid) for solid in _mjcf_solids(model, mujoco, int(geom))]
-    compiled = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    compiled = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, compiled)
     robot = yourdfpy.Robot(path.stem, list(links.values()), joints)
     states = ((str(path), crc32(compiled.tobytes()), len(compiled), 0),)
@@ -384,7 +384,7 @@ class _Shape(NamedTuple):
                 # a mirrored surface faces inwards
                 yield part.vertices * self.scale, part.faces[:, :: -1 if np.prod(self.scale) < 0 else 1]
         else:
-            yield np.asarray(self.content.vertices), np.asarray(self.content.faces, dtype=np.int64)
+            yield np.asarray(self.content.vertices), np.asarray(self.content.faces, np.int64)
 
 
 @dataclass(frozen=True)
@@ -403,7 +403,7 @@ def _assembled(content: _Described) -> Robot:
     path, joints = content.path, _from_base(content.path, content.robot)
     limits = _limits(path, joints)
     poses = {link.name: np.eye(4) for link in content.robot.links}
-    carriers: dict[str, Names] = dict.fromkeys(poses, ())
+    carriers = dict.fromkeys(poses, ())
     for joint in joints:
         poses[joint.child] = poses[joint.parent] @ _origin(joint)
         carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
@@ -449,7 +449,7 @@ def _origin(element: Any) -> Transform:
 
 def _from_base(path: Path, robot: Any) -> list[Any]:
     """Joints, each after those that carry it; raises ``ValueError`` where links and joints form no tree."""
-    links, above = [link.name for link in robot.links], dict[str, str]()
+    links, above = [link.name for link in robot.links], Texts()
     for joint in robot.joints:
         if joint.parent not in links or joint.child not in links:
             raise ValueError(f"{path}: joint {joint.name!r} names a link that is not in the file: correct it")

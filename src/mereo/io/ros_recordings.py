@@ -259,7 +259,7 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
         raise ValueError(
             f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
         )
-    data = np.asarray(message.data, dtype=np.uint8).tobytes()
+    data = np.asarray(message.data, np.uint8).tobytes()
     with open_image(BytesIO(data[HEADER:]), ("PNG",)) as image:
         raw = np.asarray(image).astype(np.uint16)
     if DEPTH_ENCODINGS[encoding] == "u2":

@@ -245,7 +245,7 @@ def _mesh_frames(path: Path) -> MeshFrames:
             f"{path} has the suffix {kinds[0]!r}; states are an NPZ or NPY file, a PVD or XDMF file, or meshes "
             f"({', '.join(FRAME_SUFFIXES)}) in a directory or of a pattern: convert or rename it"
         )
-    return MeshFrames(points, None, np.empty((0, 4), dtype=np.int64), names)
+    return MeshFrames(points, None, np.empty((0, 4), np.int64), names)
 
 
 def _rest_file(path: Path) -> Path | None:
@@ -390,9 +390,9 @@ def mesh_vertices(path: Path) -> AnyPoints:
         if path.suffix.lower() == ".obj":  # trimesh orders an OBJ file's vertices by faces and texture seams
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
             rows = [line.split()[1:4] for line in lines if line.startswith(("v ", "v\t"))]
-            vertices = np.array(rows, dtype=float).reshape(-1, 3)
+            vertices = np.array(rows, float).reshape(-1, 3)
         else:
-            vertices = np.asarray(trimesh.load_mesh(path, process=False).vertices, dtype=float)
+            vertices = np.asarray(trimesh.load_mesh(path, process=False).vertices, float)
         if len(vertices) == 0:
             raise ValueError("it has no vertices")
     return vertices

@@ -22,10 +22,11 @@ from numpy.linalg import det, inv, norm
 from scipy.ndimage import gaussian_filter
 
 from mereo.geometry.brief import listed
+from mereo.geometry.conventions import Texts, WholeNumbers
 from mereo.geometry.labels import VoxelMask, part_of_grid
 from mereo.geometry.marching_cubes import zero_surface
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, palette_color
-from mereo.geometry.transforms import Corners, Flags, Points, Transform, Vector, transform_points
+from mereo.geometry.transforms import Corners, Flags, Points, Transform, Vector, box_of, transform_points
 from mereo.io.config import Space
 from mereo.io.errors import check_size, limited_memory, quiet, readable
 from mereo.io.extras import library
@@ -67,7 +68,7 @@ class Volume:
         """Axis-aligned box of the voxels, their own extent included."""
         ends = product(*([-0.5, n - 0.5] for n in self.values.shape))
         corners = transform_points(self.T_world_index, np.array(list(ends)))
-        return np.stack([corners.min(axis=0), corners.max(axis=0)])
+        return box_of(corners)
 
     def index_of(self, points: Points) -> Points:
         """Voxel indices, with fractions, of positions."""
@@ -132,7 +133,7 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
     transform = np.eye(4)
     directions = header.get("space directions")
     if directions is not None:
-        transform[:3, :3] = np.asarray(directions, dtype=float)[-3:].T  # a row for each axis of the array
+        transform[:3, :3] = np.asarray(directions, float)[-3:].T  # a row for each axis of the array
     elif "spacings" in header:
         transform[:3, :3] = np.diag(header["spacings"][-3:])
     transform[:3, 3] = header.get("space origin", np.zeros(3))
@@ -192,7 +193,7 @@ def read_scalar_volume(path: Path) -> Volume:
     return volume
 
 
-def segment_fields(header: Any) -> dict[str, str]:
+def segment_fields(header: Any) -> Texts:
     """Fields about the segments of a segmentation of 3D Slicer (``.seg.nrrd``), of a header of any format."""
     fields = header if isinstance(header, Mapping) else {}
     return {key: str(value) for key, value in fields.items() if key.startswith("Segment")}
@@ -233,7 +234,7 @@ class LabelVolume:
     colors: Mapping[int, Color] = field(default_factory=dict)
 
     @cached_property
-    def values(self) -> tuple[int, ...]:
+    def values(self) -> WholeNumbers:
         """Labels above 0 that occur."""
         slices = (part for layer in self.labels for part in np.moveaxis(layer, 2, 0) if part.any())
         return tuple(sorted({int(value) for part in slices for value in np.unique(part)} - {0}))
@@ -296,7 +297,7 @@ class _SlicerSegment(NamedTuple):
 
 def _slicer_segments(volume: Volume) -> list[_SlicerSegment]:
     """Segments that the header of a segmentation lists; older ones have a layer each."""
-    parts = dict[int, dict[str, str]]()
+    parts = dict[int, Texts]()
     for key, text in segment_fields(volume.header).items():
         if match := re.fullmatch(r"Segment(\d+)_(\w+)", key):
             parts.setdefault(int(match[1]), {})[match[2]] = text
@@ -314,7 +315,7 @@ def _renumbered(
     path: Path, layers: Integer[ndarray, "l x y z"], segments: Sequence[_SlicerSegment]
 ) -> Integer[ndarray, "l x y z"]:
     """Layers in which each segment has its number, from 1 up, as its label: files use a label once for each layer."""
-    result = np.zeros(layers.shape, dtype=np.int16)
+    result = np.zeros(layers.shape, np.int16)
     for number, segment in enumerate(segments, start=1):
         if not 0 <= segment.layer < len(layers):
             raise ValueError(
@@ -346,7 +347,7 @@ def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
         mask = volume.labels[0] > 0
         free = (layer for layer in layers if not layer[mask].any())
         if (layer := next(free, None)) is None:
-            layers.append(layer := np.zeros(mask.shape, dtype=np.int16))
+            layers.append(layer := np.zeros(mask.shape, np.int16))
         layer[mask] = number
     if empty:
         text = f"{len(empty)} of {len(paths)} label volumes hold only empty space and are left out: {', '.join(empty)}"
@@ -394,7 +395,7 @@ NESTED = 0.95
 class ThinSegmentError(ValueError):
     """Refusal of segments that are too thin for a grid: ``thin`` has a sentence for each."""
 
-    def __init__(self, thin: dict[str, str]) -> None:
+    def __init__(self, thin: Texts) -> None:
         super().__init__(next(iter(thin.values())))
         self.thin = thin
 
@@ -424,7 +425,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     parents = _part_masks(masks)
     grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
-    thin, parts, cell = dict[str, str](), list[Segment](), abs(float(det(volume.T_world_index[:3, :3])))
+    thin, parts, cell = Texts(), list[Segment](), abs(float(det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
         part = grid.surface(margin, name, volume.colors.get(labels[index][0], palette_color(index)))
         kept = 0.0 if part is None else part.volume / (float(masks[index].sum()) * cell)

@@ -22,6 +22,7 @@ from numpy import ndarray
 
 from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Elements
+from mereo.io.atomic_files import JsonObject
 from mereo.io.errors import limited_memory, printable_line, readable, reason
 
 VTK_SUFFIXES = (".vtk", ".vtu", ".vtp")
@@ -123,10 +124,10 @@ def main(place: str) -> None:
     partial.rename(folder / ANSWER)  # VTK may still crash at its end, but not before all is written
 
 
-def _answer(files: Sequence[str], log: Any, read: list[str]) -> dict[str, Any]:
+def _answer(files: Sequence[str], log: Any, read: list[str]) -> JsonObject:
     """Arrays of all frames; ``read`` grows by each file that is done."""
     names, points, moved = list[str](), list[ndarray](), list[ndarray]()
-    tetrahedra = np.empty((0, 4), dtype=np.int64)
+    tetrahedra = np.empty((0, 4), np.int64)
     for file in files:
         for step, data in enumerate(_steps(file)):
             if "ERROR: In" in log.GetOutput():
@@ -137,9 +138,9 @@ def _answer(files: Sequence[str], log: Any, read: list[str]) -> dict[str, Any]:
             if not points:
                 tetrahedra = _tetrahedra(mesh)
             names.append(Path(file).name if len(files) > 1 else f"{step}")
-            points.append(np.array(mesh.points, dtype=float))
+            points.append(np.array(mesh.points, float))
             if displacement is not None:
-                moved.append(np.array(mesh.point_data[displacement], dtype=float))
+                moved.append(np.array(mesh.point_data[displacement], float))
         read.append(file)
     if not points:
         raise ValueError("it has no frames")
@@ -223,8 +224,8 @@ def _tetrahedra(mesh: Any) -> ndarray:
     import pyvista
 
     if not isinstance(mesh, pyvista.UnstructuredGrid):
-        return np.empty((0, 4), dtype=np.int64)
+        return np.empty((0, 4), np.int64)
     kind = pyvista.CellType.TETRA
     solid = mesh if kind in mesh.celltypes else mesh.triangulate()
     cells: Any = solid.cells_dict
-    return np.asarray(cells[kind] if kind in cells else np.empty((0, 4)), dtype=np.int64)
+    return np.asarray(cells[kind] if kind in cells else np.empty((0, 4)), np.int64)

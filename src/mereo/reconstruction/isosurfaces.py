@@ -14,10 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 from numpy import ndarray
 
+from mereo.geometry.conventions import GridShape
 from mereo.geometry.labels import GridLabels, LabelGrid, VoxelMask, part_of_grid
 from mereo.geometry.marching_cubes import CellFlags, changing_cells, nodes_of, on_both_sides, over_corners, zero_surface
-from mereo.geometry.mesh import AnyFaces, Color, Segment, SegmentedMesh
-from mereo.geometry.transforms import AnyPoints, Corners, Points, Rows, Subset, Vector, longest_side
+from mereo.geometry.mesh import AnyMesh, Color, Nested, Segment, SegmentedMesh
+from mereo.geometry.transforms import Corners, Points, Rows, Subset, Vector, longest_side
 
 GridRows = Int[ndarray, "x y z"]
 """Row of the logits of each node."""
@@ -71,7 +72,7 @@ class _Evaluator:
 
     def __init__(self, field: Field, origin: Vector, spacing: Vector) -> None:
         self.field, self.origin, self.spacing = field, origin, spacing
-        self.chunks: list[Logits] = []
+        self.chunks = list[Logits]()
         self.count = 0
 
     def __call__(self, index: Int[ndarray, "m 3"]) -> tuple[UInt8[ndarray, " m"], Subset]:
@@ -87,14 +88,14 @@ class _Evaluator:
         return np.concatenate(self.chunks)
 
 
-def sample_dense(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
+def sample_dense(field: Field, origin: Vector, spacing: Vector, shape: GridShape) -> Sampled:
     """Field evaluated at every node ``origin + [i, j, k] * spacing``."""
     evaluate = _Evaluator(field, origin, spacing)
     labels, rows = evaluate(_all_nodes(shape))
     return Sampled(labels.reshape(shape), rows.reshape(shape), evaluate.logits())
 
 
-def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
+def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: GridShape) -> Sampled:
     """Labels of ``sample_dense`` from few evaluations; every cell with a change of label is known exactly."""
     evaluate = _Evaluator(field, origin, spacing)
     # whole coarse cells: up to three nodes beyond the grid are evaluated too and cut off at the end
@@ -115,7 +116,7 @@ def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: 
     return Sampled(labels[inside], rows[inside], evaluate.logits())
 
 
-def _all_nodes(shape: tuple[int, int, int]) -> Int[ndarray, "n 3"]:
+def _all_nodes(shape: GridShape) -> Int[ndarray, "n 3"]:
     return np.indices(shape).reshape(3, -1).T
 
 
@@ -124,7 +125,7 @@ def _sloping_cells(rows: GridRows, logits: Logits) -> CellFlags:
 
     For a field of signed distances this finds every cell that a surface passes, also of a ball between the nodes.
     """
-    lead = np.full(rows.shape, np.nan, dtype=logits.dtype)
+    lead = np.full(rows.shape, np.nan, logits.dtype)
     known = rows >= 0
     best = np.partition(logits[rows[known]], -2, axis=1)
     lead[known] = best[:, -1] - best[:, -2]
@@ -152,7 +153,7 @@ def _halve(
     shape = tuple(2 * n - 1 for n in labels.shape)
     # a node between coarse nodes takes the one below: all corners of a cell that is not active agree
     fine_labels = labels[np.ix_(*(np.arange(n) // 2 for n in shape))]
-    fine_rows = np.full(shape, -1, dtype=np.int32)
+    fine_rows = np.full(shape, -1, np.int32)
     fine_rows[::2, ::2, ::2] = rows
     halves = active.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
     wanted = np.argwhere(nodes_of(halves) & (fine_rows < 0))
@@ -174,8 +175,7 @@ def _contradicted(labels: GridLabels, skipped: VoxelMask, news: Int[ndarray, "m 
     largest, smallest = np.zeros_like(labels), np.full_like(labels, 255)
     largest[place] = smallest[place] = labels[place]
     largest, smallest = _over_neighbors(largest, np.maximum), _over_neighbors(smallest, np.minimum)
-    contradicted: ndarray = skipped & ((largest > labels) | (smallest < labels))
-    return contradicted
+    return skipped & ((largest > labels) | (smallest < labels))
 
 
 def _over_neighbors(values: ndarray, combine: np.ufunc) -> ndarray:
@@ -191,9 +191,6 @@ def _over_neighbors(values: ndarray, combine: np.ufunc) -> ndarray:
 
 
 # --- isosurfaces ------------------------------------------------------------------------------------------------------
-
-Nested = tuple[tuple[str, str], ...]
-"""Pairs of names (inner, outer), see ``SegmentedMesh``."""
 
 MAX_NODES = 80_000_000
 """Nodes that a grid may have."""
@@ -246,7 +243,7 @@ def extract(
     origin, spacing, shape = _grid(box, resolution)
     sampled = (sample_dense if dense else sample_coarse_to_fine)(field, origin, spacing, shape)
     grid = LabelGrid(sampled.labels, origin, spacing, tuple(names))
-    nothing = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     empty = SegmentedMesh(tuple(Segment(*named, *nothing) for named in zip(names, colors, strict=True)), nested)
     surfaces = [
         _surface(sampled, grid, [index + 1, *(inner + 1 for inner, outer in empty.nesting if outer == index)])
@@ -256,7 +253,7 @@ def extract(
     return Extraction(replace(empty, segments=tuple(segments)), grid, len(sampled.logits))
 
 
-def _grid(box: Corners, resolution: int) -> tuple[Vector, Vector, tuple[int, int, int]]:
+def _grid(box: Corners, resolution: int) -> tuple[Vector, Vector, GridShape]:
     """Origin, spacing and number of nodes of a grid, which may end up to one cell behind the box."""
     size = box[1] - box[0]
     if resolution < 4:
@@ -332,10 +329,10 @@ def _grown(box: Corners, sides: Bool[ndarray, "2 3"], fraction: float) -> Corner
     return box + step * sides * np.array([[-1.0], [1.0]])
 
 
-def _surface(sampled: Sampled, grid: LabelGrid, held: list[int]) -> tuple[AnyPoints, AnyFaces]:
+def _surface(sampled: Sampled, grid: LabelGrid, held: list[int]) -> AnyMesh:
     """Vertices and faces around ``held``, a label and those nested in it; none where the first does not occur."""
     if not (sampled.labels == held[0]).any():
-        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
     occupied = np.argwhere(np.isin(sampled.labels, held))
     low = np.maximum(occupied.min(axis=0) - 1, 0)
     part = tuple(slice(a, b) for a, b in zip(low, occupied.max(axis=0) + 2, strict=True))

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.linalg import inv, lstsq, norm, svd
@@ -27,10 +26,11 @@ from mereo.geometry.camera import (
     SightLines,
     into_camera,
 )
-from mereo.geometry.conventions import MIN_POINTS, CloudAxes
+from mereo.geometry.conventions import MIN_POINTS, CloudAxes, Pair, Triple
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
 from mereo.geometry.surface_patches import noise_of_differences, second_differences
 from mereo.geometry.transforms import Flags, Indices, Points, Transform, Values, longest_side, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
 from mereo.reconstruction.isolation import (
@@ -95,7 +95,7 @@ class Observation:
     selection: Selection | None = None
     extent: Extent = "auto"
     initial_pose: Transform | None = None
-    point: tuple[int, int] | None = None
+    point: Pair | None = None
 
     @cached_property
     def lines(self) -> SightLines:
@@ -179,17 +179,17 @@ class Observation:
         return f"Observation({self.frame.source!r}, {points}, {size} {self.frame.length_name})"
 
     @property
-    def depth_m(self) -> tuple[float, float, float]:
+    def depth_m(self) -> Triple:
         """Nearest, middle and farthest depth of the object in metres, or in the frame's unit where it is not known."""
         return depths(self.cloud, self.frame.metres)
 
     @property
-    def size_m(self) -> tuple[float, float, float]:
+    def size_m(self) -> Triple:
         """Sides of the visible part's box in metres, or in the frame's unit where it is not known."""
         x, y, z = (np.ptp(self.cloud.points, axis=0) * self.frame.metres).tolist()
         return x, y, z
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> JsonObject:
         """Source, unit, depth, size and steps, dropped strays among them, for a result's summary.
 
         What is in metres is None where the unit is not known.
@@ -232,7 +232,7 @@ def main_length(points: Points) -> float:
     return longest_side(np.quantile(points, (0.01, 0.99), axis=0))
 
 
-def depths(cloud: PointCloud, factor: float) -> tuple[float, float, float]:
+def depths(cloud: PointCloud, factor: float) -> Triple:
     """Nearest, middle and farthest z of a cloud, times a factor."""
     near, middle, far = (np.quantile(cloud.points[:, 2], [0.0, 0.5, 1.0]) * factor).tolist()
     return near, middle, far
@@ -260,7 +260,7 @@ def find_object(
             f"the {len(cloud)} points of {frame.source} lie on a line or at one place; the object's surface must be "
             "seen: check the columns of the file, and what is cropped"
         )
-    extent: Extent = "surface" if isolation.extent == "auto" and is_surface(frame, cloud) else isolation.extent
+    extent = "surface" if isolation.extent == "auto" and is_surface(frame, cloud) else isolation.extent
     if extent == "surface":
         if frame.depth is not None:
             raise ValueError(
@@ -449,9 +449,9 @@ def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Exte
     if extent in OTHER_LINES:
         return SightLines.of_cloud(OTHER_LINES[extent])
     points = frame.cloud.points
-    is_object = np.ones(len(points), dtype=bool) if selection is None else selection.of_object(points)
+    is_object = np.ones(len(points), bool) if selection is None else selection.of_object(points)
     if frame.depth is not None and frame.depth.valid.sum() == len(points):
-        shown = np.zeros(frame.depth.depth.shape, dtype=bool)
+        shown = np.zeros(frame.depth.depth.shape, bool)
         shown[frame.depth.valid] = is_object
         lines = lines_of_image(frame.depth if frame.whole is None else frame.whole, shown)
     else:
@@ -573,7 +573,7 @@ def _evenly(u: Indices, v: Indices, distance: Values, limit: int) -> Flags:
     low, high = 0.0, float(octaves.max(initial=0.0))  # how many of them are dense
     kept = _on_grids(u, v, octaves)
     if len(u) <= limit or kept.sum() > limit:
-        return kept if len(u) > limit else np.ones(len(u), dtype=bool)
+        return kept if len(u) > limit else np.ones(len(u), bool)
     while high - low > 0.1:
         middle = 0.5 * (low + high)
         more = _on_grids(u, v, octaves - middle)

@@ -19,16 +19,16 @@ from scipy.special import expit, logsumexp, softmax
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud, into_camera
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import CloudAxes, Names
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.labels import LabelGrid, SegmentedCloud, VoxelMask, part_of_grid
-from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
+from mereo.geometry.mesh import PALETTE, SegmentColors, SegmentedMesh
 from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import Corners, Labels, Points, Rows, Transform, Vector, inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.isolation import Reading
-from mereo.reconstruction.isosurfaces import Extraction, Field, extract_whole, locate
+from mereo.reconstruction.isosurfaces import Extraction, extract_whole, locate
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
@@ -105,7 +105,7 @@ class Reconstruction:
         low, high = surfaces.bounds
         counts = np.ceil((high - low) / spacing).astype(int) + 3  # with one empty voxel around
         corner = (low + high - (counts - 1) * spacing) / 2
-        grid = replace(self.labels, labels=np.zeros(counts, dtype=np.uint8), origin=corner)
+        grid = replace(self.labels, labels=np.zeros(counts, np.uint8), origin=corner)
         grid = replace(grid, labels=label_grid(surfaces, *grid.axes()))
         segments = tuple(
             replace(
@@ -175,7 +175,7 @@ def encode_frame(reading: Reading, model: Trained | None, axes: CloudAxes = "cam
     """
     points = reading.cloud.points
     T_camera_input = into_camera(points, axes)
-    seconds: dict[str, float] = {}
+    seconds = dict[str, float]()
     seen = reading.cloud.transformed(T_camera_input)
     if model is None:
         checked_points(seen)
@@ -199,7 +199,7 @@ def extract(seen: EncodedFrame, model: Trained, resolution: int = 128, label_poi
     names, colors = segment_names(model)
     seconds, code = dict(seen.timings_s), seen.code
     assert code is not None
-    field: Field = partial(model.logits, code)
+    field = partial(model.logits, code)
     with timed(seconds, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
     with timed(seconds, "extract"):
@@ -234,7 +234,7 @@ def timed(timings: dict[str, float], stage: str) -> Iterator[None]:
     timings[stage] = time.perf_counter() - start
 
 
-def segment_names(model: Trained) -> tuple[tuple[str, ...], tuple[Color, ...]]:
+def segment_names(model: Trained) -> tuple[Names, SegmentColors]:
     """Names and colours of the classes that the model tells apart; one trained on distances knows only the whole."""
     return (model.names, model.colors) if model.segmented else (("object",), PALETTE[:1])
 
@@ -267,8 +267,8 @@ def turned_back(result: Reconstruction) -> Reconstruction:
 def segment_points(
     logits: Rows,
     points: Points,
-    names: tuple[str, ...],
-    colors: tuple[Color, ...],
+    names: Names,
+    colors: SegmentColors,
     calibration: Calibration | None = None,
     labels: Labels | None = None,
 ) -> SegmentedCloud:

@@ -31,6 +31,7 @@ from mereo.geometry.transforms import (
     Values,
     Vector,
     best_rotations,
+    box_of,
     transform_points,
 )
 from mereo.io.attachments import Attachment, Content, Surfaces, turned_attachment
@@ -204,9 +205,7 @@ def check_overlap(name: str, volume: Volume, T_scene_file: Transform, model: Sta
     boxes = []
     for bounds in (volume.bounds, model.rest.bounds):
         corners = transform_points(inv(T_scene_file), np.array(list(product(*bounds.T))))
-        boxes.append(
-            " to ".join(str(corner.round(2).tolist()) for corner in (corners.min(axis=0), corners.max(axis=0)))
-        )
+        boxes.append(" to ".join(str(corner.round(2).tolist()) for corner in box_of(corners)))
     raise ValueError(
         f"{name} holds nothing of the object: in RAS its voxels lie from {boxes[0]}, and the object's own files "
         f"from {boxes[1]}; both must have one frame and unit: export the volume in that of the object's own "
@@ -254,7 +253,7 @@ def moved(registration: Registration, points: Points, shares: SegmentShares) -> 
     for index, share in enumerate(shares.T):
         rows = np.flatnonzero(share > 0)
         if len(rows):
-            labels = np.full(len(rows), index + 1, dtype=np.uint8)
+            labels = np.full(len(rows), index + 1, np.uint8)
             result[rows] += share[rows, None] * registration.to_camera(points[rows], labels)
     return result
 
@@ -351,7 +350,7 @@ class _Fill:
             spacing *= max((count / most) ** (1 / 3), 1.01)
         origin = bounds.mean(axis=0) - (cell * cells - 1) * spacing / 2
         background = (source.values.max() if source.slope < 0 else source.values.min()).item()
-        values = np.full(cell * cells, background, dtype=source.values.dtype)
+        values = np.full(cell * cells, background, source.values.dtype)
         return cls(source, registration, interpolation, margin, origin, spacing, background, values)
 
     def at(self, index: Shaped[ndarray, "*n 3"]) -> PointArray:
@@ -369,7 +368,7 @@ class _Fill:
         owner = label_grid(solids.mesh, x, y, z)
         inside = owner > 0
         side = CELLS[0]
-        cells = np.argwhere(np.ones([n // side for n in shape], dtype=bool))
+        cells = np.argwhere(np.ones([n // side for n in shape], bool))
         reach = self.margin + np.sqrt(3) / 2 * side * self.spacing
         near = cells[solids.nearest(self.at(side * cells + (side - 1) / 2)).distance <= reach]
         rows = _flat(side * near[:, None] + _offsets(side), shape).ravel()
@@ -423,7 +422,7 @@ class _Fill:
 
     def _source_index(self, points: Points, label: int) -> Points:
         """Voxel indices, with fractions, of where points that move along with a segment were at rest."""
-        rest, labels = np.empty_like(points), np.full(len(points), label, dtype=np.uint8)
+        rest, labels = np.empty_like(points), np.full(len(points), label, np.uint8)
         for part in _parts(len(points), QUERIES_AT_ONCE):
             rest[part] = self.registration.to_rest(points[part], labels[part])
         return self.source.index_of(rest)
@@ -435,7 +434,7 @@ def _parts(count: int, most: int) -> Iterator[slice]:
 
 def _offsets(side: int) -> Int[ndarray, "v 3"]:
     """Voxels of a cell, from its first."""
-    return np.argwhere(np.ones((side, side, side), dtype=bool))
+    return np.argwhere(np.ones((side, side, side), bool))
 
 
 def _flat(index: Int[ndarray, "*n 3"], shape: Sequence[int]) -> Int[ndarray, "*n"]:

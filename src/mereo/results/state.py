@@ -147,7 +147,7 @@ def model_digest(model: StatisticalModel) -> str:
     vertices, faces, _ = model.rest.merged()
     for values in (vertices, faces, model.nodes, model.node_labels, model.mean, model.modes):
         digest.update(f"{values.shape}".encode())
-        digest.update(np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes())
+        digest.update(np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes())
     return digest.hexdigest()
 
 
@@ -248,7 +248,7 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
             f"the state belongs to the statistical model of other weights (scene {state.scene!r}, weights "
             f"{state.weights!r}); its numbers mean nothing here: give the model of those weights"
         )
-    z, drawn = np.array(state.z, dtype=float), None
+    z, drawn = np.array(state.z, float), None
     if state.draws is None:
         if len(z) != model.count:
             raise ValueError(

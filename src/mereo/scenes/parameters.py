@@ -23,7 +23,7 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformations
 from mereo.deformation.samplers import JointSampler, RandomMotion
-from mereo.geometry.conventions import Names, Range
+from mereo.geometry.conventions import Names, Pair, Range
 from mereo.io.bounds import NotNegative, Number, check_value
 from mereo.io.errors import AnyPath
 from mereo.io.yaml_document import Document
@@ -138,7 +138,7 @@ def _played(
 
 def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
     """Calls with keys counted again where calls were left out."""
-    seen: Counter[Place] = Counter()
+    seen = Counter[Place]()
     result = []
     for call in calls:
         place = call.key[0]
@@ -182,9 +182,9 @@ def _witness(scene: Scene, deformations: Deformations) -> Float[ndarray, "w 3"]:
 
 def parameters(played: Played) -> tuple[Parameter, ...]:
     """Degrees of freedom of this state, in the order in which they are drawn, with names that differ in a group."""
-    sliders: list[Parameter] = []
+    sliders = list[Parameter]()
     titles = [_title(call) for call in played.calls]
-    seen: Counter[tuple[str, Names]] = Counter()
+    seen = Counter[tuple[str, Names]]()
     for call, (group, names) in zip(played.calls, titles, strict=True):
         seen[group, names] += 1
         if titles.count((group, names)) > 1:
@@ -264,7 +264,7 @@ def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) 
     )
 
 
-def turned(shares: Shares, turn: float, seed: int | tuple[int, int]) -> Shares:
+def turned(shares: Shares, turn: float, seed: int | Pair) -> Shares:
     """Shares of many numbers moved at once, so that they stay as random as they were.
 
     As normal numbers z they go round a circle through other ones w: z cos + w sin has the same distribution everywhere
@@ -306,13 +306,13 @@ class _InOrder(Recorder):
         return self._shares[number]
 
 
-def played_back(scene: Scene, seed: int, shares: Sequence[ndarray], cure: str = "register the frame again") -> Played:
-    """State of a scene by the shares of each call; raises ``Refused``, with a ``cure``, where it does not take them."""
+def played_back(scene: Scene, seed: int, shares: Sequence[ndarray]) -> Played:
+    """State of a scene by the shares of each call; raises ``Refused`` where it does not take them."""
     played = _played_by(scene, seed, _InOrder(seed, shares))
     if played is None:
         raise Refused(
             f"the scene {scene.name!r} does not take these {len(shares)} draws; they are of another scene, or of "
-            f"another version of it: {cure}"
+            "another version of it: register the frame again"
         )
     return played
 

@@ -65,7 +65,7 @@ def interior_nodes(rest: SegmentedMesh) -> tuple[Nodes, NodeLabels]:
     points = rng.uniform(low, high, size=(CANDIDATES, 3))
     labels = Solids(rest).label(points)
     each = NODES // len(rest.segments)
-    rows = [np.empty(0, dtype=np.int64)]
+    rows = [np.empty(0, np.int64)]
     for label in range(1, len(rest.segments) + 1):
         inside = np.flatnonzero(labels == label)
         if len(inside):
@@ -267,17 +267,17 @@ class CacheWarning(UserWarning):
     """Warning that something is made each time, because it cannot be kept."""
 
 
-def kept_model(scene: Scene, count: int = OBJECT_STATES) -> StatisticalModel:
+def kept_model(scene: Scene) -> StatisticalModel:
     """Statistical model of a scene: read where it was made before, else made, and kept for the next time.
 
     A ``CacheWarning`` says where it cannot be kept.
     """
-    path = cache_folder() / "models" / f"{model_key(scene, count)}.safetensors"
+    path = cache_folder() / "models" / f"{model_key(scene, OBJECT_STATES)}.safetensors"
     with suppress(OSError, ValueError), limited_memory(path):  # not there, or damaged: it is made again
         if path.is_file():  # a pipe would be waited for
             return read_statistical_model(path.read_bytes())
     with stage("make the object's statistical model, once"):
-        made = scene_model(scene, count)
+        made = scene_model(scene, OBJECT_STATES)
     try:
         save_statistical_model(made, path)
     except (OSError, ValueError) as error:  # a full disk, a place that cannot be written to, or something else there
@@ -307,11 +307,11 @@ def model_key(scene: Scene, count: int) -> str:
     digest.update(np.ascontiguousarray(scene.T_scene_source).tobytes())
     for segment in drawn.rest.segments:
         digest.update(f"{segment.name} {segment.color} {segment.solid} {segment.faces.shape}".encode())
-        digest.update(np.ascontiguousarray(segment.faces, dtype=np.int64).tobytes())
+        digest.update(np.ascontiguousarray(segment.faces, np.int64).tobytes())
     solid = elastic_motion(drawn.sample_deformations)
     states = () if solid is not None else range(KEYED_BY)  # to draw from a solid takes seconds
     for mesh in (drawn.rest, *(drawn.sample_state(example_rng(STATES_SEED, i)).mesh for i in states)):
-        digest.update(np.ascontiguousarray(mesh.merged()[0], dtype=float).tobytes())
+        digest.update(np.ascontiguousarray(mesh.merged()[0], float).tobytes())
     if solid is not None:
         digest.update(f"{solid.digest} {solid.motion!r}".encode())
     return digest.hexdigest()[:32]

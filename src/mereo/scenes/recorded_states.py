@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformations
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
+from mereo.geometry.conventions import Triple
 from mereo.geometry.mesh import Elements, Segment, SegmentedMesh, Vertices
 from mereo.geometry.transforms import AnyPoints, Points, Vector, longest_side
 from mereo.io.simulation_states import SurfaceRecord, TetrahedralRecord, read_states
@@ -59,7 +60,7 @@ def load_states(
     *,
     mesh: Path | None = None,
     scale: float = 1.0,
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    shift: Triple = (0.0, 0.0, 0.0),
     held_out: float = HELD_OUT,
 ) -> SplitStates:
     """Recorded states of an object; ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
@@ -75,7 +76,7 @@ def load_states(
     Raises ``FileNotFoundError`` for nothing at ``path``, ``ImportError`` for a format of VTK without the extra
     `simulation`, ``ValueError`` for damaged files, frames that do not fit ``rest``, or turn something inside out.
     """
-    offset = np.asarray(shift, dtype=float)
+    offset = np.asarray(shift, float)
     if not (np.isfinite(scale) and scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
         raise ValueError(f"scale is {scale} and shift {shift}; they must be finite, scale above 0, shift of 3 numbers")
     record = read_states(Path(path), rest.names, mesh)
@@ -247,7 +248,7 @@ def _order(path: Path, segment: Segment, count: int, known: Float[ndarray, "w 3"
             f"{size:.3g} across; without tetrahedra they must be the same vertices in the same pose: check the unit, "
             "scale and shift, or name a mesh with tetrahedra"
         )
-    return np.asarray(nearest, dtype=np.int64)
+    return np.asarray(nearest, np.int64)
 
 
 def _check_order(path: Path, segment: Segment, vertices: Vertices) -> None:

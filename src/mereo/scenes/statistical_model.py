@@ -7,11 +7,9 @@ deviation, so the prior of the coefficients ``z`` is N(0, 1) each. Lengths are s
 Notation: m material points (first the vertices of ``rest.merged()``, then the nodes), k modes, n states.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
@@ -22,6 +20,7 @@ from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.brief import counted, listed
+from mereo.geometry.conventions import Facts, Names, WholeNumbers
 from mereo.geometry.mesh import Faces, Segment, SegmentedMesh
 from mereo.geometry.symmetry import TOLERANCE, Symmetry, find_symmetries
 from mereo.geometry.transforms import Labels, Points, Transform, Values, Vector, fit_rigid, transform_points
@@ -70,7 +69,7 @@ class PairDistances:
     @classmethod
     def none(cls) -> "PairDistances":
         """No pairs."""
-        return cls(*(np.empty(0, dtype=np.int64),) * 2, *(np.empty(0),) * 2)
+        return cls(*(np.empty(0, np.int64),) * 2, *(np.empty(0),) * 2)
 
 
 def kept_distances(
@@ -106,7 +105,7 @@ def _distances(
     points = mean + (z @ modes.reshape(3 * len(mean), z.shape[1]).T).reshape(len(z), -1, 3)
     squared = (points**2).sum(axis=2)
     product = np.matmul(points, points.transpose(0, 2, 1))
-    return np.asarray(np.sqrt(np.maximum(squared[:, :, None] + squared[:, None] - 2 * product, 0.0)))
+    return np.sqrt(np.maximum(squared[:, :, None] + squared[:, None] - 2 * product, 0.0))
 
 
 # --- statistical model ------------------------------------------------------------------------------------------------
@@ -114,7 +113,7 @@ def _distances(
 SPARSE, SILHOUETTE_VERTICES = 200, 1500
 """Material points by which states of the library are compared, and vertices compared with what a frame rules out."""
 
-OF_REST: tuple[str, ...] = (
+OF_REST: Names = (
     *("faces", "vertex_counts", "labels", "rest_points", "half", "rest_center"),
     *("anchors", "rest_anchors", "silhouette_vertices", "sparse"),
 )
@@ -172,7 +171,7 @@ class StatisticalModel:
         return find_symmetries(self.rest, TOLERANCE)
 
     @property
-    def swaps(self) -> tuple[tuple[int, ...], ...]:
+    def swaps(self) -> tuple[WholeNumbers, ...]:
         """Exchanges of segments that no frame tells from the rest pose: for each segment the one in its place."""
         swaps = (tuple(i for i in each.lands_on if i is not None) for each in self.symmetries if each.swaps)
         return tuple(dict.fromkeys(swaps))
@@ -188,7 +187,7 @@ class StatisticalModel:
         return self.rest.merged()[1].astype(np.int64)
 
     @cached_property
-    def vertex_counts(self) -> tuple[int, ...]:
+    def vertex_counts(self) -> WholeNumbers:
         """Number of vertices of each segment."""
         return tuple(len(segment.vertices) for segment in self.rest.segments)
 
@@ -252,7 +251,7 @@ class StatisticalModel:
 
     def around(self, mean: MaterialPoints, modes: Float32[ndarray, "m 3 d"]) -> "StatisticalModel":
         """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
-        library = np.zeros((0, modes.shape[2]), dtype=np.float32)
+        library = np.zeros((0, modes.shape[2]), np.float32)
         other = replace(self, mean=mean, modes=modes, library=library, pairs=PairDistances.none())
         vars(other).update({name: getattr(self, name) for name in OF_REST})
         return other
@@ -338,7 +337,7 @@ def material_points(mesh: SegmentedMesh, nodes: Float[ndarray, "j 3"]) -> Materi
 def following(anchors: tuple[Anchors, ...], points: Points, labels: Labels) -> PointWeights:
     """Weights of points by the anchors of their own segments."""
     width = max((min(len(a.index), 32) for a in anchors), default=1)
-    index = np.zeros((len(points), width), dtype=np.int64)
+    index = np.zeros((len(points), width), np.int64)
     weight = np.zeros((len(points), width))
     for label in np.unique(labels):
         rows = np.flatnonzero(labels == label)
@@ -396,7 +395,7 @@ def pack_model(model: StatisticalModel) -> tuple[dict[str, ndarray], JsonObject]
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}, facts
 
 
-def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel:
+def unpack_model(tensors: Tensors, facts: Facts) -> StatisticalModel:
     """Inverse of ``pack_model`` up to rounding."""
     index, (mean, std) = tensors["pair_index"].astype(np.int64), tensors["pair_distance"].astype(float)
     steps = np.concatenate([tensors["wide_modes"], tensors["modes"]], axis=2, dtype=np.float32)
@@ -415,9 +414,9 @@ def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel
     )
 
 
-def save_statistical_model(model: StatisticalModel, path: Path, dataset: str | None = None) -> None:
-    """Write a statistical model as one safetensors file, whole or not at all; ``dataset`` is the key of its dataset."""
-    write_whole(path, statistical_model_bytes(model, dataset))
+def save_statistical_model(model: StatisticalModel, path: Path) -> None:
+    """Write a statistical model as one safetensors file, whole or not at all."""
+    write_whole(path, statistical_model_bytes(model))
 
 
 def statistical_model_bytes(model: StatisticalModel, dataset: str | None = None) -> bytes:
@@ -482,7 +481,7 @@ def _narrow(index: ndarray) -> ndarray:
     return index.astype(np.uint16 if index.size == 0 or index.max() < 2**16 else np.uint32)
 
 
-def _rest(tensors: Tensors, facts: Mapping[str, Any]) -> SegmentedMesh:
+def _rest(tensors: Tensors, facts: Facts) -> SegmentedMesh:
     """The segments at rest."""
     vertices, faces = tensors["vertices"].astype(float), tensors["faces"].astype(np.int64)
     first, start, segments = 0, 0, []

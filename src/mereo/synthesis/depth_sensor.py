@@ -227,7 +227,7 @@ def sample_holes(
 
     A Poisson number of ellipses at object pixels with gamma-distributed radii (shape 5).
     """
-    holes = np.zeros(depth.shape, dtype=bool)
+    holes = np.zeros(depth.shape, bool)
     rows, columns = np.nonzero(seen)
     if len(rows) == 0 or sensor.holes == 0:
         return holes

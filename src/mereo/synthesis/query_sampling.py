@@ -172,7 +172,7 @@ class _Draws:
         self.index, self.box, self.need, self.outside = index, box, need, outside
         self.rng = default_rng(seed)
         self.points = np.empty((0, box.shape[1]))
-        self.labels = np.empty(0, dtype=np.uint8)
+        self.labels = np.empty(0, np.uint8)
         self.fewest = 0
 
     def sides(self) -> tuple[ndarray, ndarray]:

@@ -386,7 +386,7 @@ def write_recording(
         counts=np.array([(len(segment.vertices), len(segment.faces)) for segment in rest.segments]),
         T_world_camera=poses,
         draws=draws,
-        sizes=np.array(sizes, dtype=np.int64),
+        sizes=np.array(sizes, np.int64),
     )
     index = {
         "format": 1,

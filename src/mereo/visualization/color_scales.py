@@ -9,7 +9,8 @@ from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import as_exact_as
-from mereo.geometry.mesh import Color, Colors, Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.conventions import Names
+from mereo.geometry.mesh import Colors, Segment, SegmentColors, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
 from mereo.geometry.transforms import Points, Values
 from mereo.models.trained import Answer
@@ -43,13 +44,13 @@ _HEX = (
 )
 """Its 256 colours, six digits each."""
 
-TABLE: UInt8[ndarray, "256 3"] = np.frombuffer(bytes.fromhex(_HEX), dtype=np.uint8).reshape(256, 3)
+TABLE: UInt8[ndarray, "256 3"] = np.frombuffer(bytes.fromhex(_HEX), np.uint8).reshape(256, 3)
 """Colours from the least number to the greatest; read-only."""
 
 
 def viridis(values: Float[ndarray, "*shape"]) -> UInt8[ndarray, "*shape 3"]:
     """Colour of each value between 0 (dark) and 1 (bright); what lies outside has that of the nearer end, NaN of 0."""
-    index = np.clip(np.nan_to_num(np.asarray(values, dtype=float)) * len(TABLE), 0, len(TABLE) - 1)
+    index = np.clip(np.nan_to_num(np.asarray(values, float)) * len(TABLE), 0, len(TABLE) - 1)
     return TABLE[index.astype(np.int64)]
 
 
@@ -68,8 +69,8 @@ class ColorScale:
     title: str
     low: float
     high: float
-    stops: tuple[Color, ...]
-    words: tuple[str, ...]
+    stops: SegmentColors
+    words: Names
 
     def colors(self, values: Values) -> Colors:
         """Colours (red, green, blue) of numbers, linear between the stops; NaN is grey."""

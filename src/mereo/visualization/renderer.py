@@ -13,6 +13,7 @@ from numpy import ndarray
 from scipy.sparse import csr_array
 
 from mereo.geometry.camera import Camera, PixelValues, Size
+from mereo.geometry.conventions import Pair
 from mereo.geometry.mesh import Color, Faces, SegmentedMesh, Vertices
 from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import (
@@ -60,7 +61,7 @@ class Viewpoint:
         margin: float = 1.08,
     ) -> "Viewpoint":
         """Orthographic view along ``direction``, with ``up`` upwards, that shows the whole box ``bounds``."""
-        turned = look_at(np.zeros(3), np.asarray(direction, dtype=float), np.asarray(up, dtype=float))
+        turned = look_at(np.zeros(3), np.asarray(direction, float), np.asarray(up, float))
         rotation = inverse_rigid(turned)[:3, :3]
         half = np.abs(rotation[:2]) @ (bounds[1] - bounds[0]) / 2
         return cls(rigid(rotation, -rotation @ bounds.mean(axis=0)), margin * max(float(half.max()), 1e-12))
@@ -116,7 +117,7 @@ class Triangles:
     def of(cls, mesh: SegmentedMesh, colors: list[Color] | None = None) -> "Triangles":
         """Triangles of all segments in their colours, or in ``colors``, one for each segment."""
         vertices, faces, owner = mesh.merged()
-        palette = np.asarray(mesh.colors if colors is None else colors, dtype=float).reshape(-1, 3) / 255.0
+        palette = np.asarray(mesh.colors if colors is None else colors, float).reshape(-1, 3) / 255.0
         return cls(vertices, faces, palette[owner], corner_normals(vertices, faces), owner)
 
 
@@ -169,7 +170,7 @@ class Canvas:
 
     def _outline(self, part: Int[ndarray, "h w"]) -> None:
         """Darken pixels next to another part or next to the background."""
-        edge = np.zeros(part.shape, dtype=bool)
+        edge = np.zeros(part.shape, bool)
         for axis in (0, 1):
             for step in (1, -1):
                 edge |= part != np.roll(part, step, axis=axis)
@@ -221,14 +222,14 @@ def _cast(
     """For each ray the first face (-1: none), the distance in lengths of its direction, barycentric weights."""
     if len(faces) == 0:
         return np.full(len(origins), -1), np.full(len(origins), np.inf), np.zeros((len(origins), 3))
-    vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
+    vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
     face, share, place = cast_rays(search_tree(vertices, faces), vertices, faces, origins, directions)
     place[face < 0] = 0.0  # else it is whatever was in memory
     weights = np.concatenate([1 - place.sum(axis=1, keepdims=True), place], axis=1)
     return face, np.where(face >= 0, share, np.inf), weights
 
 
-def enclosed(mesh: SegmentedMesh) -> set[tuple[int, int]]:
+def enclosed(mesh: SegmentedMesh) -> set[Pair]:
     """Pairs (inner, outer) of segments' indices: those declared nested, and those of which one is around the other.
 
     It is around a point where it is met from there in six directions, along the axes and against them. So it may have

@@ -123,7 +123,7 @@ class _Arrays:
 
 
 def _material(segment: Segment, opaque: bool) -> JsonObject:
-    color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
+    color = [*_linear(np.array(segment.color, np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
     return material if opaque else {**material, "alphaMode": "BLEND"}

@@ -86,7 +86,7 @@ def code_tensors(code: Code) -> dict[str, Tensor]:
 
 def code_of(tensors: dict[str, Tensor]) -> Code:
     """Code from its tensors, the inverse of ``code_tensors``; only lines of sight need cloud and viewpoint."""
-    levels: list[Level] = []
+    levels = list[Level]()
     while (name := f"centers{len(levels) + 1}") in tensors:
         levels.append(Level(tensors[name], tensors[name.replace("centers", "features")]))
     alignment = Alignment(tensors["rotation"], tensors["shift"]) if "rotation" in tensors else None

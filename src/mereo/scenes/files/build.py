@@ -383,7 +383,7 @@ def _refined_surface(rest: SegmentedMesh, states: list[Deformations], limits: Ra
 
 def _bent(ends: Float[ndarray, "e 2 3"], maps: list[Deformation], limits: Range) -> Bool[ndarray, " e"]:
     """Which edges a map makes a curve of, farther from its chord than the first limit, if longer than the second."""
-    result, (tolerance, shortest) = np.zeros(len(ends), dtype=bool), limits
+    result, (tolerance, shortest) = np.zeros(len(ends), bool), limits
     long = norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
     for deform in maps:
         rows = np.flatnonzero(long & ~result)

@@ -30,7 +30,7 @@ from mereo.deformation import samplers
 from mereo.deformation.elastic import ElasticSampler, ElasticSolid, Material, build_lattice
 from mereo.deformation.maps import unit
 from mereo.deformation.samplers import DeformationSampler
-from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.conventions import UNITS_M, Texts, Triple
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import Corners, Indices, Normalizer, Points, Values, Vector, longest_side
@@ -53,7 +53,7 @@ def _ascending(value: tuple[float, float]) -> tuple[float, float]:
     return value
 
 
-def _pointing(value: tuple[float, float, float]) -> tuple[float, float, float]:
+def _pointing(value: Triple) -> Triple:
     if not any(value):
         raise ValueError("it is a direction and must have a length")
     return value
@@ -383,8 +383,8 @@ class HeldPlace(Block):
             return -cKDTree(held).query(nodes)[0]
         offset = nodes - target.point(self.center)
         if self.direction is not None:
-            return np.asarray(offset @ unit(np.array(self.direction)))
-        return np.asarray((self.radius or 0.0) * target.unit - norm(offset, axis=1))
+            return offset @ unit(np.array(self.direction))
+        return (self.radius or 0.0) * target.unit - norm(offset, axis=1)
 
     def _rows(self, nodes: Points, numbers: Indices | None, target: Target) -> Int[np.ndarray, " r"]:
         """Rows of the nodes that are held one by one."""
@@ -393,7 +393,7 @@ class HeldPlace(Block):
                 points = model_points(read_points(target.folder / (self.points or ""))[:, :3])
             except (ValueError, OSError) as error:
                 raise Misfit("held", str(error)) from error
-            return np.asarray(cKDTree(nodes).query(target.placement.apply(points))[1])
+            return cKDTree(nodes).query(target.placement.apply(points))[1]
         if numbers is None:
             raise Misfit("held", "a lattice has no nodes with numbers: name the file of `tetrahedra`, or give `points`")
         unknown = np.setdiff1d(self.nodes, numbers)
@@ -649,7 +649,7 @@ class StatesBlock(Block):
     mesh: FileName | None = None
 
     @model_serializer
-    def _written(self) -> str | dict[str, str]:
+    def _written(self) -> str | Texts:
         """The path alone where there is no mesh: an object's identity in datasets is made of it."""
         return self.positions if self.mesh is None else {"positions": self.positions, "mesh": self.mesh}
 

@@ -15,7 +15,7 @@ from numpy.linalg import eigh, lstsq, norm
 from numpy.random import default_rng
 
 from mereo.deformation.maps import Compose, Rigid
-from mereo.geometry.conventions import Range
+from mereo.geometry.conventions import Pair, Range, WholeNumbers
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import search_tree
@@ -72,7 +72,7 @@ def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     reach = CLEARANCE * longest_side(mesh.bounds)
     vectors = [area_vectors(segment.vertices, segment.faces) for segment in mesh.segments]
     areas = [float(norm(each, axis=1).sum()) for each in vectors]
-    touching: list[Contact] = []
+    touching = list[Contact]()
     for pair in combinations(range(len(mesh.segments)), 2):
         first, second = sorted(pair, key=lambda index: areas[index])
         points, normals = _touching(mesh.segments[first], mesh.segments[second], reach)
@@ -88,7 +88,7 @@ def _normals(segment: Segment, face: Indices) -> Points:
 
 def _distance(points: Points, segment: Segment) -> tuple[Values, Indices]:
     """Distance of points to a surface, and the nearest face."""
-    vertices, faces = np.array(segment.vertices), np.array(segment.faces, dtype=np.int64)
+    vertices, faces = np.array(segment.vertices), np.array(segment.faces, np.int64)
     squared, face, _ = search_tree(vertices, faces).squared_distance(vertices, faces, np.ascontiguousarray(points))
     return np.sqrt(squared), face.astype(np.int64)
 
@@ -130,7 +130,7 @@ def _largest_plane(points: Points, normals: Points, reach: float) -> Flags:
     """The largest set of points of one normal and offset."""
     offsets = normals @ points.T  # of all points along each one's normal
     alike = (normals @ normals.T > SAME_NORMAL) & (np.abs(offsets - np.diag(offsets)[:, None]) < reach)
-    return np.asarray(alike[alike.sum(axis=1).argmax()])
+    return alike[alike.sum(axis=1).argmax()]
 
 
 def _longest(points: Points) -> tuple[Vector, float]:
@@ -205,7 +205,7 @@ class Joint:
 
     contact: Contact
     hinge: bool
-    moved: tuple[int, ...]
+    moved: WholeNumbers
     axis: Vector
     most: Range
     alone: Range
@@ -220,7 +220,7 @@ def proposed_joints(mesh: SegmentedMesh) -> tuple[Joint, ...]:
     """Joints of an assembly at rest, those that move least first, as a chain wants it."""
     touching = contacts(mesh)
     test = _CollisionTest(mesh)
-    joints: list[Joint] = []
+    joints = list[Joint]()
     for contact in sorted(touching, key=lambda each: each.kind):  # cylinders before planes
         if contact.kind == "other" or _held(contact, joints):
             continue
@@ -252,7 +252,7 @@ def _joint(
     axis = contact.axis if hinge else contact.along
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
     closed = [(each.first, each.second) for each in touching if not _allows(each, contact, hinge, axis, reach)]
-    side = connected(np.array(closed, dtype=np.int64).reshape(-1, 2), len(mesh.segments))
+    side = connected(np.array(closed, np.int64).reshape(-1, 2), len(mesh.segments))
     if side[contact.first] == side[contact.second]:
         return None
     groups = [tuple(np.flatnonzero(side == side[index]).tolist()) for index in (contact.first, contact.second)]
@@ -298,14 +298,14 @@ class _CollisionTest:
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.mesh = mesh
         self.reach = CLEARANCE * longest_side(mesh.bounds)
-        self._known = dict[tuple[tuple[int, int], tuple[Chain, Chain]], bool]()
+        self._known = dict[tuple[Pair, tuple[Chain, Chain]], bool]()
 
     def free(self, joint: Joint, steps: Sequence[float]) -> float:
         """First of the steps, from the farthest to the nearest, over which nothing collides; 0 where there is none."""
         free = (step for step in steps if not any(self.pairs([joint], [step * share]) for share in (0.5, 1.0)))
         return next(free, 0.0)
 
-    def pairs(self, joints: Sequence[Joint], ways: Sequence[float]) -> list[tuple[int, int]]:
+    def pairs(self, joints: Sequence[Joint], ways: Sequence[float]) -> list[Pair]:
         """Indices of the segments that collide where each joint has gone its way, in degrees or the mesh's unit."""
         motions = [(joint, way) for joint, way in zip(joints, ways, strict=True) if way]
         chains = [tuple(each for each in motions if index in each[0].moved) for index in range(len(self.mesh.segments))]
@@ -388,7 +388,7 @@ def _blamed(
     joints: Sequence[Joint],
     share: Float[ndarray, " joints"],
     ranges: Float[ndarray, "joints 2"],
-) -> set[tuple[int, int]]:
+) -> set[Pair]:
     """Joints, and the side (0 for the least, 1 for the most) of their ranges, that bring segments into collision."""
     ways = (np.maximum(share, 0.0) * ranges[:, 1] + np.maximum(-share, 0.0) * ranges[:, 0]).tolist()
     return {

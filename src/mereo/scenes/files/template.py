@@ -24,7 +24,7 @@ from scipy.spatial import ConvexHull, QhullError
 from mereo.deformation.maps import moved_by, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.conventions import UNITS_M, Names, Range, Way
+from mereo.geometry.conventions import UNITS_M, Facts, Names, Range, Texts, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import (
@@ -38,7 +38,7 @@ from mereo.geometry.transforms import (
     longest_side,
     transform_points,
 )
-from mereo.io.atomic_files import check_file_place, write_file
+from mereo.io.atomic_files import JsonObject, check_file_place, write_file
 from mereo.io.config import MeshesConfig, RobotMeshes
 from mereo.io.robots import ROBOT_SUFFIXES, RobotJoint, is_robot, read_object_file, read_robot
 from mereo.io.volume_files import (
@@ -318,8 +318,8 @@ class _Source(NamedTuple):
     up: int
     up_reason: str
     assembly: bool = True
-    lost: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    lost: Names = ()
+    notes: Names = ()
     robot: tuple[RobotJoint, ...] | None = None
 
 
@@ -453,7 +453,7 @@ def _from_volumes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     if not volume.values:
         raise ValueError(f"{files[0]} holds only empty space; a label volume has values above 0: export it again")
     names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in volume.values}
-    thin = dict[str, str]()
+    thin = Texts()
     try:
         mesh, cells, losses = _surfaces(volume, names)
     except ThinSegmentError as error:
@@ -479,7 +479,7 @@ def _surfaces(
 
     Raises ``ThinSegmentError`` where none does.
     """
-    thin = dict[str, str]()
+    thin = Texts()
     for cells in LABEL_CELLS:
         with warnings.catch_warnings(record=True) as losses:
             warnings.simplefilter("always", LabelWarning)
@@ -570,7 +570,7 @@ class _Moves(NamedTuple):
     way: Way
     joints: Sequence[Joint]
     blocks: Blocks
-    robot: Sequence[dict[str, Any]] = ()
+    robot: Sequence[JsonObject] = ()
 
     def describe(self) -> str:
         if not self.blocks:
@@ -598,7 +598,7 @@ def _joint_block(joint: Joint) -> JointBlock:
     return JointBlock(type="joint", pivot=(x, y, z), axis=(u, v, w), angle=angle, slide=slide)
 
 
-def _robot_block(joint: RobotJoint) -> dict[str, Any]:
+def _robot_block(joint: RobotJoint) -> JsonObject:
     """Block of a joint of a robot's file."""
     limits = np.rad2deg(joint.limits) if joint.turns else np.array(joint.limits)
     numbers = {"pivot": joint.pivot, "axis": joint.axis, "angle" if joint.turns else "slide": limits}
@@ -686,7 +686,7 @@ def _range(values: Range) -> str:
     return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
-def _yaml(blocks: Sequence[Mapping[str, Any]]) -> str:
+def _yaml(blocks: Sequence[Facts]) -> str:
     """Blocks as YAML, their lists on a line each."""
     return yaml.safe_dump(
         list(blocks), sort_keys=False, allow_unicode=True, default_flow_style=None, width=float("inf")
