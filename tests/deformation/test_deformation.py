@@ -1,11 +1,10 @@
 """Every deformation: positive Jacobian, inverse, closed form, and the bounds beyond which it is refused."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy import ndarray
 from numpy.linalg import det, norm
 from numpy.random import Generator, default_rng
 from scipy.interpolate import BSpline
@@ -40,7 +39,7 @@ REACH = HALF * 3**0.5
 BOX = np.array([[-HALF] * 3, [HALF] * 3])
 
 
-def direction(rng: Generator) -> np.ndarray:
+def direction(rng: Generator) -> ndarray:
     vector = rng.normal(size=3)
     return vector / norm(vector)
 
@@ -65,7 +64,7 @@ def make_sweep(rng: Generator) -> Deformation:
     )
 
 
-MAKERS: dict[str, Callable[[Generator], Deformation]] = {
+MAKERS = {
     "identity": lambda rng: Identity(),
     "rigid": lambda rng: Rigid(rng.uniform(-2, 2, 3), rng.uniform(-5, 5, 3), rng.uniform(-5, 5, 3)),
     "bend": make_bend,
@@ -80,7 +79,7 @@ MAKERS: dict[str, Callable[[Generator], Deformation]] = {
 }
 
 
-def cube(rng: Generator, count: int = 300) -> np.ndarray:
+def cube(rng: Generator, count: int = 300) -> ndarray:
     return rng.uniform(*BOX, size=(count, 3))
 
 
@@ -262,7 +261,7 @@ def test_transported_frames_are_rotations_that_do_not_twist() -> None:
 
 
 ORIGIN, Z = np.zeros(3), np.array([0.0, 0.0, 1.0])
-REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+REFUSED = {
     "bend": (
         lambda: Bend(ORIGIN, *np.eye(3)[[2, 0]], 4.0, 2.0, 3.0),
         "curvature 0.5 times radius 3 is 1.5; it must be below 1 .*: bend less sharply or make the object thinner",

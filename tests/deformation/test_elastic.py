@@ -7,6 +7,7 @@ from functools import cache
 import numpy as np
 import pytest
 from lattice import fine, lattice
+from numpy import ndarray
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from shapes import box
@@ -48,11 +49,11 @@ def partly_filled() -> ElasticSolid:
 
 
 @cache
-def modes(scale: float = 1.0, young: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def modes(scale: float = 1.0, young: float = 1.0) -> tuple[ndarray, ndarray]:
     return find_modes(solid(scale), COUNT, Material(young=young))
 
 
-def covariance(scale: float = 1.0, young: float = 1.0, power: float = 2.0) -> np.ndarray:
+def covariance(scale: float = 1.0, young: float = 1.0, power: float = 2.0) -> ndarray:
     """Of all nodes' coordinates, which no sign or order of modes changes."""
     flat = scale_modes(*modes(scale, young), motion=0.2 * scale, power=power).reshape(-1, COUNT)
     return flat @ flat.T
@@ -168,7 +169,7 @@ def test_no_drawn_state_folds_or_swells_however_large_the_motion() -> None:
     assert calmed > 6
 
 
-def no_surface() -> tuple[np.ndarray, np.ndarray]:
+def no_surface() -> tuple[ndarray, ndarray]:
     return np.empty((0, 3)), np.empty((0, 3))
 
 
@@ -176,7 +177,7 @@ def test_a_stiffer_part_bends_less() -> None:
     bar = SegmentedMesh((box((0, 0, 0), (3, 1, 1), "left", 0), box((3, 0, 0), (6, 1, 1), "right", 1)))
     even, uneven = (build_lattice(bar, 12, stiffness) for stiffness in ((1.0, 1.0), (1.0, 50.0)))
 
-    def energies(body: ElasticSolid) -> np.ndarray:
+    def energies(body: ElasticSolid) -> ndarray:
         """Strain energy of each half in the softest modes, under the same stiffness."""
         _, vectors = find_modes(body, 4, Material())
         center, flat = body.mesh.nodes[body.mesh.elements].mean(axis=1)[:, 0], vectors.reshape(-1, 4)

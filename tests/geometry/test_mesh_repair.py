@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -180,7 +181,7 @@ def test_what_a_cut_drops_is_said_with_its_share() -> None:
 
 
 @pytest.mark.parametrize("axes", [np.array([[1, 2, 3]]), np.array([[1, 2, 3], [3, -1, 2]])])
-def test_a_line_or_plane_in_any_direction_is_no_solid(axes: np.ndarray) -> None:
+def test_a_line_or_plane_in_any_direction_is_no_solid(axes: ndarray) -> None:
     places = default_rng(0).random((12, len(axes))) @ axes
     for vertices in (places, places.astype(np.float32).astype(float)):
         health = examine(Segment("part", (1, 2, 3), vertices, np.arange(12).reshape(4, 3)))
@@ -326,7 +327,7 @@ def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.
 WHOLE = ball((0, 0, 0), 2.0, level=3)
 
 
-def nodes(*axes: np.ndarray) -> np.ndarray:
+def nodes(*axes: ndarray) -> ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
@@ -341,7 +342,7 @@ def crossing() -> Segment:
     return replace(joined(WHOLE, ball((1.5, 0, 0), 2.0, level=3)), solid=False)
 
 
-def truth(points: np.ndarray, part: Segment) -> np.ndarray:
+def truth(points: ndarray, part: Segment) -> ndarray:
     centers = [(0, 0, 0), (1.5, 0, 0)][: 1 + (len(part.vertices) > len(WHOLE.vertices))]
     return np.min([norm(points - center, axis=-1) for center in centers], axis=0) - 2.0
 
@@ -380,7 +381,7 @@ def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
     assert (queries.labels == 1).sum() >= 16 and np.isfinite(queries.distances).all()
 
 
-def convex_polyhedron(seed: int) -> tuple[Segment, np.ndarray, np.ndarray]:
+def convex_polyhedron(seed: int) -> tuple[Segment, ndarray, ndarray]:
     """A random convex hull with the outward unit normals and offsets of its faces' planes."""
     mesh = trimesh.convex.convex_hull(default_rng(seed).normal(size=(60, 3)))
     normal = np.array(mesh.face_normals)
@@ -414,7 +415,7 @@ def test_outside_a_box_distance_and_direction_have_closed_forms() -> None:
 def test_a_point_on_the_surface_takes_the_outward_normal() -> None:
     solids = Solids(one(box((0, 0, 0), (2, 2, 2))))
     points = np.array([[2.0, 0.7, 0.4], [0.3, 0.0, 1.1]])
-    distance, direction = signed_distance_and_direction(solids, points, np.zeros(2, dtype=np.uint8))
+    distance, direction = signed_distance_and_direction(solids, points, np.zeros(2, np.uint8))
     assert np.allclose(distance, 0) and np.allclose(direction, [[1, 0, 0], [0, -1, 0]])
 
 

@@ -5,12 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from numpy import ndarray
+from numpy.linalg import det
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from shapes import segment
 
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import Nested, SegmentedMesh
 from mereo.geometry.metrics import with_segments_exchanged
 from mereo.geometry.symmetry import describe_symmetries, find_symmetries
 from mereo.geometry.transforms import fit_rigid, rigid, transform_points
@@ -18,7 +20,7 @@ from mereo.geometry.transforms import fit_rigid, rigid, transform_points
 POSE = rigid(Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix(), np.array([5.0, -3.0, 8.0]))
 
 
-def posed(*parts: trimesh.Trimesh, pose: np.ndarray = POSE, nested: tuple[tuple[str, str], ...] = ()) -> SegmentedMesh:
+def posed(*parts: trimesh.Trimesh, pose: ndarray = POSE, nested: Nested = ()) -> SegmentedMesh:
     segments = (replace(segment(part), name="abc"[i]) for i, part in enumerate(parts))
     return SegmentedMesh(tuple(segments), nested).transformed(pose)
 
@@ -105,7 +107,7 @@ def test_a_fit_of_noisy_pairs_is_the_one_of_scipy_and_nothing_near_it_is_better(
     expected = Rotation.align_vectors(target - aim, source - middle, weights=weights)[0].as_matrix()
     assert_allclose(found, rigid(expected, aim - expected @ middle), atol=1e-9)
 
-    def error(motion: np.ndarray) -> float:
+    def error(motion: ndarray) -> float:
         return float(weights @ np.sum((transform_points(motion, source) - target) ** 2, axis=1))
 
     for _ in range(50):
@@ -123,4 +125,4 @@ def test_mirrored_points_are_turned_not_mirrored() -> None:
     source = default_rng(3).normal(size=(30, 3))
     rotation = fit_rigid(source, source * [-1, 1, 1])[:3, :3]
     assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    assert det(rotation) == pytest.approx(1.0)

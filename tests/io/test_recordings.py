@@ -5,9 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from folder_contents import refusal
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.io.atomic_files import JsonObject
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import CameraWarning
 from mereo.io.ros_recordings import recorded_frame, recorded_frames
@@ -113,10 +116,10 @@ def test_other_compressions_are_refused(tmp_path: Path, format_: str) -> None:
 
 
 def test_point_clouds_keep_their_missing_points_until_asked(tmp_path: Path) -> None:
-    points = np.random.default_rng(1).normal((0, 0, 2), 0.1, (80, 3)).astype(np.float32)
+    points = default_rng(1).normal((0, 0, 2), 0.1, (80, 3)).astype(np.float32)
     points[5] = np.nan
     path = write_bag(tmp_path / "a.mcap", 2, lambda m: {"/points": [m.cloud(points)]})
-    assert_array_equal(recorded_frame(path).read(), points.astype(np.float64))
+    assert_array_equal(recorded_frame(path).read(), points.astype(float))
     with pytest.raises(ValueError, match="1 of 80 points without a measurement.*--drop-invalid"):
         read_frame(path)
     assert len(read_frame(path, InputConfig(drop_invalid=True)).cloud) == 79
@@ -154,7 +157,7 @@ def test_one_broken_frame_stops_nothing(tmp_path: Path) -> None:
         ({"frame": "scanner"}, "is a recording; those are always in the camera frame"),
     ],
 )
-def test_what_a_recording_does_not_have_is_said(tmp_path: Path, options: dict[str, Any], expected: str) -> None:
+def test_what_a_recording_does_not_have_is_said(tmp_path: Path, options: JsonObject, expected: str) -> None:
     with pytest.raises(ValueError, match=expected):
         read_frame(write_bag(tmp_path / "a.bag", 1, depth_topics), InputConfig(**options))
 
@@ -168,8 +171,7 @@ def test_what_is_no_recording_of_depth_is_said(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"has neither depth images .* only /c \(sensor_msgs/msg/Image\)"):
         recorded_frame(color)
     (tmp_path / "noise.mcap").write_bytes(b"noise" * 50)
-    with pytest.raises(ValueError, match=r"noise.mcap cannot be read as a ROS bag") as caught:
+    with refusal(r"noise.mcap cannot be read as a ROS bag"):
         recorded_frame(tmp_path / "noise.mcap")
-    assert "\n" not in str(caught.value)
     with pytest.raises(FileNotFoundError, match="does not exist; a ROS bag is needed"):
         recorded_frame(tmp_path / "no.bag")

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 from folder_contents import read_json
+from numpy.random import Generator
 from safetensors.torch import load_file
 from small_training import SMALL
+from torch import Tensor
 from toy_data import half_balls, read_all, write_toy_dataset
 
 from mereo.models.weights import load_model
@@ -51,13 +53,13 @@ def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> 
     assert visible_m == (pytest.approx(0.1, rel=0.1), pytest.approx(0.2, rel=0.1))
 
 
-def observed(generator: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+def observed(generator: Generator, points: int, queries: int) -> dict[str, np.ndarray]:
     """Half balls, and three halves of their cloud, of which the last has fewer points."""
     row = half_balls(generator, points, queries)
     cloud, half = row["cloud"], points // 2
     parts = [cloud[:half], cloud[-half:], cloud[10:40]]
     seen = np.stack([part[np.arange(points) % len(part)] for part in parts]).astype(np.float16)
-    return row | {"seen": seen, "seen_count": np.array([len(part) for part in parts], dtype=np.int32)}
+    return row | {"seen": seen, "seen_count": np.array([len(part) for part in parts], np.int32)}
 
 
 def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
@@ -112,7 +114,7 @@ def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
     plain = data.batch(torch.arange(6), 96, 0, NONE, Draws.of(0))
     rolled = augment_batch(plain, AugmentConfig(roll=True), Draws.of(1))
 
-    def gaps(batch: Batch) -> torch.Tensor:
+    def gaps(batch: Batch) -> Tensor:
         everything = torch.cat([batch.positions[:, :20], batch.cloud[:, :20], batch.viewpoint[:, None]], dim=1).double()
         distances = torch.cdist(everything, everything)
         return distances / distances.amax(dim=(1, 2), keepdim=True)
@@ -170,7 +172,7 @@ def pair(folders: tuple[Path, Path]) -> tuple[Dataset, Dataset]:
     return Dataset.load(folders[0]), Dataset.load(folders[1])
 
 
-def batch_of(data: Dataset, probability: float, observation: torch.Tensor | None = None, seed: int = 0) -> Batch:
+def batch_of(data: Dataset, probability: float, observation: Tensor | None = None, seed: int = 0) -> Batch:
     augment = AugmentConfig(observations=probability, keep_points=(0.7, 1.0), jitter_std=0.003)
     return data.batch(torch.arange(8), 48, 32, augment, Draws.of(seed), observation)
 

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -112,7 +111,7 @@ def test_a_lost_network_is_no_damage(whole: Path, stored: Place, monkeypatch: py
 # --- changed files ----------------------------------------------------------------------------------------------------
 
 
-DAMAGE: dict[str, Callable[[bytes, bytes], bytes]] = {
+DAMAGE = {
     "its checksum is another": lambda content, _: content[:-100] + bytes([content[-100] ^ 1]) + content[-99:],
     "it is of another dataset": lambda _, other: other,
     "": lambda content, _: content[:200],

@@ -6,6 +6,7 @@ import sys
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
 from mereo.models.export.onnx_export import trilinear
 from mereo.models.neighbors import _by_rank, ball_query, gather, nearest, squared_distances
@@ -17,11 +18,11 @@ from mereo_learning.losses import rest_loss
 TINY = PRESETS["tiny"].network
 
 
-def random_points(batch: int, count: int, seed: int = 0) -> torch.Tensor:
+def random_points(batch: int, count: int, seed: int = 0) -> Tensor:
     return torch.rand(batch, count, 3, generator=torch.Generator().manual_seed(seed)) * 2 - 1
 
 
-def slow_ball_query(centers: torch.Tensor, points: torch.Tensor, radius: float, limit: int) -> torch.Tensor:
+def slow_ball_query(centers: Tensor, points: Tensor, radius: float, limit: int) -> Tensor:
     result = torch.empty(*centers.shape[:2], limit, dtype=torch.long)
     for b in range(len(centers)):
         for m, center in enumerate(centers[b]):
@@ -78,11 +79,11 @@ def test_compiled_networks_call_the_same_searches() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def matrices(count: int) -> torch.Tensor:
+def matrices(count: int) -> Tensor:
     return torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0))
 
 
-def special() -> torch.Tensor:
+def special() -> Tensor:
     """Equal singular values, rank two, a reflection, columns in no order of length, and values far apart."""
     flat = matrices(1)[0].clone()
     flat[:, 2] = flat[:, 0] + flat[:, 1]
@@ -91,7 +92,7 @@ def special() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("matrix", [matrices(200), special()], ids=["random", "special"])
-def test_svd_has_orthogonal_factors_that_multiply_to_the_matrix(matrix: torch.Tensor) -> None:
+def test_svd_has_orthogonal_factors_that_multiply_to_the_matrix(matrix: Tensor) -> None:
     u, values, vh = svd3(matrix)
     identity = torch.eye(3).expand_as(matrix)
     torch.testing.assert_close(u.transpose(1, 2) @ u, identity, atol=1e-5, rtol=0)

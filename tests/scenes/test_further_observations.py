@@ -91,7 +91,7 @@ def test_half_precision_moves_no_point_by_more_than_its_noise(data: tuple[Path, 
 
 
 def test_one_that_hardly_sees_the_object_is_the_first_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
-    views: list[SimulatedView] = []
+    views = []
 
     def blind(*arguments: object) -> SimulatedView:
         view = observe(*arguments)  # type: ignore[arg-type]

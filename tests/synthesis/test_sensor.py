@@ -6,7 +6,8 @@ from statistics import NormalDist
 import numpy as np
 import pytest
 import trimesh
-from numpy.linalg import norm
+from numpy import ndarray
+from numpy.linalg import norm, svd
 from numpy.random import default_rng
 from shapes import ball, box, one, segment
 from toy_scene import toy_scene
@@ -36,7 +37,7 @@ CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions()
 OFF = SensorConfig()
 UNIT_M = OFF.metres_per_unit
-MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
+MODELS = ("structured-light", "time-of-flight")
 
 
 def wall(z: float, tilt_deg: float = 0.0) -> Solids:
@@ -46,7 +47,7 @@ def wall(z: float, tilt_deg: float = 0.0) -> Solids:
     return Solids(one(replace(part, vertices=part.vertices @ turn.T + [0, 0, z])))
 
 
-def slant(tilt_deg: float) -> np.ndarray:
+def slant(tilt_deg: float) -> ndarray:
     """Angle between each ray and that wall's normal."""
     normal = np.array([np.sin(np.deg2rad(tilt_deg)), 0, np.cos(np.deg2rad(tilt_deg))])
     return np.arccos(np.abs(RAYS @ normal) / norm(RAYS, axis=-1))
@@ -152,14 +153,14 @@ def test_holes_take_the_expected_area() -> None:
     assert abs((lost == 0).mean() - np.exp(-2)) < 5 * np.sqrt(np.exp(-2) / len(views))
 
 
-def masks(seen: np.ndarray, count: int = 300, **terms: float) -> np.ndarray:
+def masks(seen: ndarray, count: int = 300, **terms: float) -> ndarray:
     drawn = (dict(zip(SENSOR_TERMS, default_rng(i).spawn(11), strict=True)) for i in range(count))
     return np.stack([sample_mask(seen, replace(OFF, **terms), rngs) for rngs in drawn])
 
 
 def test_the_mask_is_off_and_shifted_as_probably_as_asked() -> None:
     """Pixels beside a straight edge are half a pixel away from it, the next ones one and a half."""
-    seen = np.zeros((60, 60), dtype=bool)
+    seen = np.zeros((60, 60), bool)
     seen[:, :30] = True
     drawn = masks(seen, mask_offset_px=0.8)
     for column, distance in ((30, 0.5), (31, 1.5)):
@@ -324,7 +325,7 @@ def test_a_background_is_behind_everything_and_outside_a_true_mask() -> None:
         plane = seen.source == BACKGROUND
         points = (seen.whole.depth[..., None] * RAYS)[plane]
         center = points.mean(axis=0)
-        normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
+        normal = svd(points - center, full_matrices=False)[2][2]
         normal *= np.sign(normal[2])
         assert normal[2] > np.cos(np.pi / 4) - 1e-9
         gap = (center - vertices) @ normal
