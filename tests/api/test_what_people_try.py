@@ -32,6 +32,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from toy_frames import MODEL, NAMES, seen
 from toy_scene import toy_scene
+from trimesh.creation import box
 
 import mereo
 from mereo import load_frame, load_object, reconstruct
@@ -147,12 +148,10 @@ def test_columns_behind_positions_are_normals_or_colours() -> None:
 
 # --- what goes in: meshes ---------------------------------------------------------------------------------------------
 
-LEFT, RIGHT = (
-    trimesh.creation.box((20, 30, 10), trimesh.transformations.translation_matrix((x, 0, 0))) for x in (0, 20)
-)
+LEFT, RIGHT = (box((20, 30, 10), trimesh.transformations.translation_matrix((x, 0, 0))) for x in (0, 20))
 BOXES = {"left": LEFT, "right": RIGHT}
 LEFT.metadata["name"], RIGHT.metadata["name"] = BOXES
-SMALL = trimesh.creation.box((0.1, 0.1, 0.1))
+SMALL = box((0.1, 0.1, 0.1))
 
 
 def arrays(mesh: trimesh.Trimesh) -> tuple[ndarray, ndarray]:

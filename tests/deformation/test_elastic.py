@@ -3,6 +3,7 @@
 import pickle
 from dataclasses import replace
 from functools import cache
+from math import nan
 
 import numpy as np
 import pytest
@@ -209,7 +210,7 @@ def test_what_is_held_does_not_move_and_nothing_is_rigid() -> None:
 
 
 def test_bad_materials_lattices_and_modes_are_refused() -> None:
-    for value in (0.5, -1.0, np.nan):
+    for value in (0.5, -1.0, nan):
         with pytest.raises(ValueError, match="must lie between -1 and 0.5: take 0.4 for tissue"):
             Material(value)
     with pytest.raises(ValueError, match="a lattice of 1 cells cannot bend; 2 or more are needed: take 16"):
@@ -217,7 +218,7 @@ def test_bad_materials_lattices_and_modes_are_refused() -> None:
     (part,) = block().segments
     with pytest.raises(ValueError, match="has no inside: turn its faces outward"):
         build_lattice(SegmentedMesh((replace(part, faces=part.faces[:, ::-1].copy()),)), 8)
-    for share in (0.0, 1.5, np.nan):
+    for share in (0.0, 1.5, nan):
         with pytest.raises(ValueError, match="must be above 0 and at most 1: leave empty ones out"):
             ElasticSolid(lattice(), np.full(len(lattice().elements), share))
     small = build_lattice(block(), 2)
@@ -225,7 +226,7 @@ def test_bad_materials_lattices_and_modes_are_refused() -> None:
     for count in (0, most + 1):
         with pytest.raises(ValueError, match=f"{count} modes of .* nodes; from 1 to {most} exist: take more cells"):
             find_modes(small, count, Material())
-    for value in (0.0, np.inf, np.nan):
+    for value in (0.0, np.inf, nan):
         with pytest.raises(ValueError, match="must be above 0: take 1, which changes no mode"):
             Material(young=value)
         with pytest.raises(ValueError, match="it must be above 0: a tenth of half the longest side is moderate"):

@@ -23,17 +23,23 @@ SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
 """From the files' coordinates to those of the scene, in which ``boxes`` are."""
 
 
+Arrays = dict[str, ndarray]
+
+Written = tuple[Path, Path]
+"""A file of states, and that of the mesh at rest."""
+
+
 def to_file(points: ndarray) -> ndarray:
     return (points - SHIFT) / SCALE
 
 
-def moved_vertices() -> dict[str, ndarray]:
+def moved_vertices() -> Arrays:
     """Positions [frames, vertices, 3] of both segments, scene coordinates."""
     maps = [TetrahedralMap(lattice(), nodes) for nodes in states()]
     return {part.name: np.stack([f(part.vertices) for f in maps]) for part in boxes().segments}
 
 
-def soup() -> dict[str, ndarray]:
+def soup() -> Arrays:
     return {part.name: part.faces.ravel() for part in boxes().segments}
 
 
@@ -87,7 +93,7 @@ def surface(vertices: ndarray) -> Any:
 DISPLACEMENTS = (states() - lattice().nodes) / SCALE
 
 
-def numpy_and_volume(path: Path) -> tuple[Path, Path]:
+def numpy_and_volume(path: Path) -> Written:
     """Positions as PyBullet or a script of SOFA records them, beside the simulated mesh with triangles in it."""
     np.save(path / "run.npy", to_file(states()).astype(np.float32))
     mesh = grid(lattice().nodes)
@@ -95,7 +101,7 @@ def numpy_and_volume(path: Path) -> tuple[Path, Path]:
     return path / "run.npy", path / "volume.vtk"
 
 
-def numpy_and(suffix: str, path: Path) -> tuple[Path, Path]:
+def numpy_and(suffix: str, path: Path) -> Written:
     """Positions beside the simulated mesh as Gmsh or Abaqus writes it."""
     meshio = pytest.importorskip("meshio", reason="meshio is not installed: pip install 'mereo[dev]'")
     np.save(path / "run.npy", to_file(states()))
@@ -104,7 +110,7 @@ def numpy_and(suffix: str, path: Path) -> tuple[Path, Path]:
     return path / "run.npy", path / f"volume{suffix}"
 
 
-def numpy_and_surface(path: Path) -> tuple[Path, Path]:
+def numpy_and_surface(path: Path) -> Written:
     moved = np.concatenate(list(moved_vertices().values()), axis=1)
     np.save(path / "run.npy", to_file(moved[:, ::-1]))
     surface(boxes().merged()[0]).save(path / "rest.ply")
@@ -125,7 +131,7 @@ def pattern_of_both(path: Path) -> Path:
     return path / "run_*.vtk"
 
 
-def collection(path: Path) -> tuple[Path, Path]:
+def collection(path: Path) -> Written:
     (path / "parts").mkdir()
     for frame, nodes in enumerate(states()):
         grid(nodes).save(path / "parts" / f"{frame}.vtu")
@@ -173,7 +179,7 @@ ROUNDED = ("ply", "stl", "obj", "NPY, VTK", "NPY, PLY")
 """Those in single precision or of eight digits."""
 
 
-def load_written(written: Path | tuple[Path, Path]) -> SplitStates:
+def load_written(written: Path | Written) -> SplitStates:
     """States from a path, or a path and a mesh beside it."""
     path, mesh = written if isinstance(written, tuple) else (written, None)
     return load_states(path, boxes(), mesh=mesh, scale=SCALE, shift=SHIFT)
@@ -205,11 +211,11 @@ def test_a_sequence_of_positions_starts_at_rest_and_hexahedra_are_divided(tmp_pa
     assert np.abs(Tetrahedra(record.rest_nodes, record.tetrahedra).volumes).sum() == pytest.approx(6 * 3 * 3)
 
 
-def tetrahedral(**changes: ndarray) -> dict[str, ndarray]:
+def tetrahedral(**changes: ndarray) -> Arrays:
     return {"rest_nodes": lattice().nodes, "tetrahedra": lattice().elements, "nodes": states()} | changes
 
 
-def surfaces(**changes: ndarray) -> dict[str, ndarray]:
+def surfaces(**changes: ndarray) -> Arrays:
     return moved_vertices() | changes
 
 
@@ -283,7 +289,7 @@ def single_surface(path: Path) -> Path:
     return path / "*.vtp"
 
 
-def other_surface(path: Path) -> tuple[Path, Path]:
+def other_surface(path: Path) -> Written:
     run, mesh = numpy_and_surface(path)
     surface(1.01 * boxes().merged()[0]).save(mesh)
     return run, mesh

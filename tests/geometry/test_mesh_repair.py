@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from math import nan
 from pathlib import Path
 
 import manifold3d
@@ -141,7 +142,7 @@ def test_what_is_too_thin_for_the_finest_cells_is_said() -> None:
 
 def test_all_faults_of_a_segment_are_named_at_once() -> None:
     crossing = joined(ball((0, 0, 0), 2.0), ball((2, 0, 0), 2.0), ball((9, 0, 0), 0.05, level=1))
-    vertices = np.concatenate([crossing.vertices, [[np.nan, 0, 0]]])
+    vertices = np.concatenate([crossing.vertices, [[nan, 0, 0]]])
     faces = crossing.faces.copy()
     faces[[10, 400]] = faces[[10, 400], ::-1]
     first = faces[0]
@@ -245,7 +246,7 @@ def test_what_is_no_solid_may_have_fewer_faces(tmp_path: Path, monkeypatch: pyte
 
 
 def test_nothing_is_made_of_nothing() -> None:
-    empty = Segment("part", (1, 2, 3), np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
+    empty = Segment("part", (1, 2, 3), np.full((3, 3), nan), np.array([[0, 1, 2]]))
     assert examine(empty).hopeless
     with pytest.raises(ValueError, match="'part' has no surface that could be repaired"):
         repaired(empty)
@@ -362,7 +363,7 @@ def test_the_mark_travels_and_relaxes_the_check_only_for_marked_segments() -> No
     with pytest.raises(ValueError, match="open edges; it must be closed"):
         SegmentedMesh((replace(mesh.segments[0], solid=True),)).check()
     with pytest.raises(ValueError, match="NaN"):
-        SegmentedMesh((replace(mesh.segments[0], vertices=WHOLE.vertices * np.nan),)).check()
+        SegmentedMesh((replace(mesh.segments[0], vertices=WHOLE.vertices * nan),)).check()
 
 
 def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from shapes import segment
+from trimesh.creation import box, cylinder, icosphere
 
 from mereo.geometry.mesh import Nested, SegmentedMesh
 from mereo.geometry.metrics import with_segments_exchanged
@@ -29,16 +30,16 @@ def moved(part: trimesh.Trimesh, x: float, y: float = 0.0, z: float = 0.0) -> tr
     return part.copy().apply_translation((x, y, z))
 
 
-CUBOID, BALL = trimesh.creation.box((20, 30, 50)), trimesh.creation.icosphere(radius=20, subdivisions=4)
+CUBOID, BALL = box((20, 30, 50)), icosphere(radius=20, subdivisions=4)
 
 
 @pytest.mark.parametrize(
     ("part", "count"),
     [
         (CUBOID, 3),
-        (trimesh.creation.box((20, 20, 50)), 7),
-        (trimesh.creation.cylinder(15, 50, sections=6), 11),
-        (trimesh.creation.cylinder(10, 50, sections=64), 2),  # about its axis, and over end
+        (box((20, 20, 50)), 7),
+        (cylinder(15, 50, sections=6), 11),
+        (cylinder(10, 50, sections=64), 2),  # about its axis, and over end
         (trimesh.creation.cone(10, 50, sections=64), 1),
         (BALL, 1),
     ],
@@ -65,8 +66,8 @@ def test_an_axis_is_named_in_the_frame_of_the_object() -> None:
 def test_segments_that_change_places_are_told_from_those_that_land_on_none() -> None:
     halves = find_symmetries(posed(moved(CUBOID, -10), moved(CUBOID, 10)), 0.3)
     assert {(symmetry.lands_on, symmetry.swaps) for symmetry in halves} == {((0, 1), False), ((1, 0), True)}
-    core = trimesh.creation.icosphere(radius=5)
-    beam = trimesh.creation.box((20, 4, 4))  # it would survive a half turn
+    core = icosphere(radius=5)
+    beam = box((20, 4, 4))  # it would survive a half turn
     (bottle,) = find_symmetries(posed(beam, moved(trimesh.creation.cone(15, 60, sections=64), 0, 0, -20)), 0.3)
     assert bottle.angle is None and bottle.lands_on == (None, 1)
     (hidden,) = find_symmetries(posed(moved(core, 8), BALL, nested=(("a", "b"),)), 0.3)
@@ -75,7 +76,7 @@ def test_segments_that_change_places_are_told_from_those_that_land_on_none() -> 
 
 
 def test_a_small_part_on_the_surface_breaks_the_symmetry() -> None:
-    knob = trimesh.creation.icosphere(radius=2)
+    knob = icosphere(radius=2)
     assert find_symmetries(posed(CUBOID, moved(knob, 12, 3)), 0.3) == ()
     assert len(find_symmetries(posed(CUBOID, moved(knob, 2, 3)), 0.3)) == 3, "what is inside is not seen"
     with pytest.raises(ValueError, match="the tolerance is 0; it must be above 0"):

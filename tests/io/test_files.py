@@ -8,6 +8,7 @@ import sys
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ def test_arrays_in_numpy_files(tmp_path: Path) -> None:
 
 def test_missing_points_are_refused_with_the_cure_or_dropped(tmp_path: Path) -> None:
     points = POINTS.copy()
-    points[3], points[5, 1], points[9] = np.nan, np.inf, 0
+    points[3], points[5, 1], points[9] = nan, np.inf, 0
     for name, content in (("a.ply", save_ply(points, "binary_little_endian")), ("b.pcd", save_pcd(points, "binary"))):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=r"3 of 57 points without a measurement.*--drop-invalid"):
@@ -468,7 +469,7 @@ def test_what_is_opaque_is_the_object(tmp_path: Path) -> None:
 
 MILLIMETRES = default_rng(5).integers(400, 9000, (6, 8)).astype(np.uint16)
 MILLIMETRES[2, 3] = 0
-METRES = np.where(MILLIMETRES > 0, MILLIMETRES / np.float32(1000), np.nan).astype(np.float32)
+METRES = np.where(MILLIMETRES > 0, MILLIMETRES / np.float32(1000), nan).astype(np.float32)
 
 
 @pytest.mark.parametrize("name", ["short.tif", "float.tiff", "big.tif", "short.npy", "double.npy"])
@@ -532,7 +533,7 @@ def test_normals_of_a_ply_file_are_read_with_its_points(tmp_path: Path) -> None:
         assert_array_equal(cloud.points, POINTS.astype(float))
         length = norm(normals, axis=1, keepdims=True)
         assert_allclose(cloud.normals, normals / length, atol=1e-6)
-    rows[3], rows[5, 3] = 0.0, np.nan
+    rows[3], rows[5, 3] = 0.0, nan
     (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())
     cloud = read_point_cloud(tmp_path / "b.ply", drop_invalid=True)
     assert cloud.normals is not None and len(cloud.normals) == len(cloud) == 56 and np.isfinite(cloud.normals).all()

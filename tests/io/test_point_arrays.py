@@ -1,6 +1,7 @@
 """Every form of a frame in memory gives the same points; what is none gets one sentence with its cure."""
 
 from collections.abc import Iterator
+from math import nan
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -43,7 +44,7 @@ def test_own_types_are_returned_and_others_are_copied_in_all_their_digits() -> N
 def broken(points: ndarray) -> ndarray:
     """The points with three that are no measurements: the second, the fourth and the tenth."""
     made = points.copy().reshape(-1, 3)
-    made[1], made[3, 2], made[9] = np.nan, -np.inf, 0
+    made[1], made[3, 2], made[9] = nan, -np.inf, 0
     return made.reshape(points.shape)
 
 
@@ -126,7 +127,7 @@ REFUSED = {
     "ragged": ([[1, 2, 3], [4, 5]], "^the list is no array .its rows differ in length.; n x 3 numbers are needed: "),
     "tensor without values": (torch.ones(9, 3, device="meta"), "^the Tensor is no array"),
     "empty message": (message(POINTS[:0]), "^the PointCloud2 message holds 0 points"),
-    "only NaN": (np.full((6, 3), np.nan), "^all 6 points of the ndarray of shape .6, 3. are NaN, infinite, zero"),
+    "only NaN": (np.full((6, 3), nan), "^all 6 points of the ndarray of shape .6, 3. are NaN, infinite, zero"),
     "fields": (np.ones(9, [("u", "f4"), ("v", "f4")]), "has the fields u, v; x, y and z are needed: rename"),
     "field of words": (np.ones(9, [("x", "f4"), ("y", "U3"), ("z", "f4")]), "^the field 'y' of .* values of type <U3"),
     "field of rows": (np.ones(9, [("x", "f4", 2), ("y", "f4"), ("z", "f4")]), "'x' of .* holds several numbers"),
@@ -178,7 +179,7 @@ def test_points_of_a_model_may_be_its_origin_and_must_be_finite() -> None:
         PointCloud(np.array([[0.0, 0, 0], [1, 2, 3]])),
     ):
         assert_array_equal(model_points(form), [[0, 0, 0], [1, 2, 3]])
-    for wrong in ([[0, 0, np.nan]], np.empty((0, 3)), [[1e13, 0, 0]]):
+    for wrong in ([[0, 0, nan]], np.empty((0, 3)), [[1e13, 0, 0]]):
         with pytest.raises(
             ValueError, match=r"of shape .* has no points, or some that are NaN, infinite or beyond 1e.12"
         ):
@@ -201,5 +202,5 @@ def test_normals_of_other_libraries_come_with_the_points() -> None:
     longer, lost = points_of(SimpleNamespace(points=broken(POINTS), normals=3.0 * POINTS), drop_invalid=True)
     assert isinstance(longer, PointCloud) and lost == 3
     assert_allclose(longer.normals, MEASURED / norm(MEASURED, axis=1, keepdims=True))
-    for normals in ([], POINTS[:3], np.full(POINTS.shape, np.nan), "none"):
+    for normals in ([], POINTS[:3], np.full(POINTS.shape, nan), "none"):
         assert points_of(SimpleNamespace(points=POINTS, normals=normals))[0].normals is None  # type: ignore[union-attr]

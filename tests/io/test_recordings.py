@@ -18,7 +18,7 @@ from mereo.io.sensor_frame import read_frame
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
 
-from recorded_bags import DEPTH_MM, Messages, depth_topics, write_bag
+from recorded_bags import DEPTH_MM, Messages, Topics, depth_topics, write_bag
 
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 
@@ -63,7 +63,7 @@ def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_fram
 
 
 def test_the_unit_is_that_which_the_sdk_of_a_realsense_records(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         depth, unit = make.image(DEPTH_MM[0], "16UC1"), make.types["std_msgs/msg/String"](data="0.000100")
         return {"/a/Depth_0": [depth], "/b": [make.info()], "/a/option/Depth_Units/value": [unit]}
 
@@ -80,7 +80,7 @@ def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
 
 
 def test_compressed_depth_is_found_beside_compressed_colour(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         return {
             "/camera/color/image_raw/compressed": [make.compressed(DEPTH_MM[0], "bgr8; jpeg compressed bgr8")],
             "/camera/depth/image_raw/compressedDepth": [
@@ -126,7 +126,7 @@ def test_point_clouds_keep_their_missing_points_until_asked(tmp_path: Path) -> N
 
 
 def test_distortion_counts_unless_the_topic_is_rectified(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         image = make.image(DEPTH_MM[0], "16UC1")
         info = make.info(focal=20.0, distortion=0.2)
         return {"/d/image_raw": [image], "/d/image_rect": [image], "/d/camera_info": [info]}
@@ -138,7 +138,7 @@ def test_distortion_counts_unless_the_topic_is_rectified(tmp_path: Path) -> None
 
 
 def test_one_broken_frame_stops_nothing(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         good, odd = make.image(DEPTH_MM[0], "16UC1"), make.image(DEPTH_MM[0, :, :4], "16UC1")
         return {"/d/image": [good, odd, good], "/d/camera_info": [make.info()]}
 

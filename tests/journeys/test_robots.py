@@ -3,6 +3,7 @@
 import json
 import pickle
 import re
+from math import pi
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -409,11 +410,11 @@ def test_known_values_narrow_the_random_states_whoever_states_them(known: mereo.
 def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> None:
     (tmp_path / "laptop.urdf").write_text(LAPTOP.replace("revolute", "continuous"))
     laptop = mereo.load_object(tmp_path / "laptop.urdf")
-    for value in (3.1 - 2 * np.pi, 3.1 + 4 * np.pi):
+    for value in (3.1 - 2 * pi, 3.1 + 4 * pi):
         scene = laptop.with_joints({"hinge": {"value": value, "within": 0.1}}).scene
         assert scene is not None and isinstance(scene.sample_deformations, RandomMotion)
         shares = np.array(scene.sample_deformations.joints["hinge"][0].shares)
-        assert_allclose((2 * np.pi * shares - np.pi) % (2 * np.pi), [3.0, 3.2], atol=1e-9)
+        assert_allclose((2 * pi * shares - pi) % (2 * pi), [3.0, 3.2], atol=1e-9)
 
 
 NO_JOINTS = {

@@ -103,7 +103,11 @@ def agree(found: JsonObject, expected: tuple[ndarray, ...]) -> None:
     assert np.asarray(found["logits"]).std() > 100 * TOLERANCE, "the comparison would be empty"
 
 
-def export(case: str, place: Path, kind: str) -> tuple[Model, Path]:
+Exported = tuple[Model, Path]
+"""A model and the folder that it was exported to."""
+
+
+def export(case: str, place: Path, kind: str) -> Exported:
     """By the command, in a process of its own: the tests' shape checks know no sizes that are left open."""
     weights = case
     if case != SHIPPED:
@@ -205,7 +209,7 @@ FULL_SIZE = "paper"
 
 
 @pytest.fixture(scope="module", params=[*CASES, FULL_SIZE, SHIPPED])
-def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, Path]:
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """A model, and the folder of its graphs as the command writes it."""
     for package in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(package, reason=f"{package} is not installed: pip install 'mereo[onnx]'")
@@ -213,7 +217,7 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.mark.slow
-def test_onnx_graphs_answer_as_the_network_and_the_folder_says_what_it_holds(exported: tuple[Model, Path]) -> None:
+def test_onnx_graphs_answer_as_the_network_and_the_folder_says_what_it_holds(exported: Exported) -> None:
     import onnxruntime
 
     model, folder = exported
@@ -245,7 +249,7 @@ runpy.run_path("mereo_onnx.py", run_name="__main__")
 
 
 @pytest.mark.slow
-def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Path]) -> None:
+def test_the_runner_answers_as_the_model_without_torch(exported: Exported) -> None:
     model, folder = exported
     cloud = raw_cloud(3000)
     low, high, size = cloud.min(axis=0), cloud.max(axis=0), np.ptp(cloud, axis=0).max()

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from shapes import one
 from torch import Tensor, nn
+from torch.testing import assert_close
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
@@ -201,7 +202,7 @@ def test_a_folded_network_answers_the_same(config: NetworkConfig) -> None:
     with torch.inference_mode():
         expected, found = (each.query(each.encode(cloud, eye), queries) for each in (network, folded))
     for name in ("logits", "distance"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
+        assert_close(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
     assert expected.logits.std() > 1e-2
     # the original stays as it was: it can still be saved
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
@@ -336,7 +337,7 @@ def test_a_new_lookup_changes_no_answer() -> None:
     with torch.inference_mode():
         before, after = (network(cloud, viewpoint_of(), queries).prediction for network in (plain, added))
     for answer, same in zip(after[:3], before[:3], strict=True):
-        torch.testing.assert_close(answer, same)  # products of other widths may be added in another order
+        assert_close(answer, same)  # products of other widths may be added in another order
     assert before.rest is None and after.rest.shape == queries.shape
 
 

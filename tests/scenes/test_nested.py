@@ -1,5 +1,7 @@
 """A segment inside a segment: every rule of docs/method.md, on balls whose answers are in closed form."""
 
+from math import pi
+
 import numpy as np
 import pytest
 from analytic import ball as distance_to_ball
@@ -58,7 +60,7 @@ def test_what_is_nested_in_a_nested_segment_is_nested_too_and_owns_its_shell() -
     assert onion().nesting == ((0, 1), (0, 2), (1, 2)) and organ(()).nesting == ()
     meshes = np.array([segment.volume for segment in onion().segments])
     assert_allclose(onion().owned_volumes, np.diff(meshes, prepend=0.0))
-    assert_allclose(onion().owned_volumes / (4 / 3 * np.pi), [1, 7, 19], rtol=0.01)
+    assert_allclose(onion().owned_volumes / (4 / 3 * pi), [1, 7, 19], rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -158,8 +160,8 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: Nest
     spheres = 1 if nested else 2  # that bound the organ's mesh
     assert [len(part.vertices) - len(part.faces) // 2 for part in (inner, outer)] == [2, 2 * spheres]
     volumes = found.surfaces.owned_volumes
-    assert volumes[0] == pytest.approx(4 / 3 * np.pi * 0.45**3, rel=0.02)
-    assert volumes.sum() == pytest.approx(4 / 3 * np.pi, rel=0.01)
+    assert volumes[0] == pytest.approx(4 / 3 * pi * 0.45**3, rel=0.02)
+    assert volumes.sum() == pytest.approx(4 / 3 * pi, rel=0.01)
     apart = cKDTree(outer.vertices).query(inner.vertices)[0].max()  # marching cubes is in single precision
     assert apart > 0.1 if nested else apart < 1e-5
 

@@ -18,7 +18,8 @@ from mereo.models.trained import Answer, EncodedCloud
 from mereo_learning.config import PRESETS
 
 Points = ndarray
-Distance = Callable[[Points], ndarray]
+Field = Callable[[Points], ndarray]
+Distance = Field
 """Signed distance, negative inside."""
 
 
@@ -40,7 +41,7 @@ def union(*distances: Distance) -> Distance:
     return lambda points: np.min([distance(points) for distance in distances], axis=0)
 
 
-def logits_of(*distances: Distance, sharpness: float = 1.0) -> Callable[[Points], ndarray]:
+def logits_of(*distances: Distance, sharpness: float = 1.0) -> Field:
     """Segment k's logit is minus its distance, that of empty space the least distance."""
 
     def field(points: Points) -> ndarray:
@@ -64,11 +65,11 @@ def untrained(names: Names, scene: str = "rope", seed: int = 0) -> Model:
 class AnalyticModel(Model):
     """Encodes as any model does, but answers with a field in the user's frame, or in the network's (``normalized``)."""
 
-    field: Callable[[Points], ndarray] = np.zeros_like
+    field: Field = np.zeros_like
     normalized: bool = False
 
     @classmethod
-    def of(cls, field: Callable[[Points], ndarray], names: Names, normalized: bool = False) -> "AnalyticModel":
+    def of(cls, field: Field, names: Names, normalized: bool = False) -> "AnalyticModel":
         return cls(tiny_network(len(names)), names, PALETTE[: len(names)], field=field, normalized=normalized)
 
     def logits(self, code: EncodedCloud, points: Points) -> ndarray:

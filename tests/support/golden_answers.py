@@ -157,7 +157,11 @@ def digest(*arrays: ndarray) -> str:
     return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:12]
 
 
-def answers_of(name: str) -> dict[str, JsonObject]:
+Answers = dict[str, JsonObject]
+"""Facts of the answers to an object's frames, by the frames' names."""
+
+
+def answers_of(name: str) -> Answers:
     import torch
 
     torch.set_num_threads(1)
@@ -212,7 +216,7 @@ def last_bits_of(name: str, trials: int = TRIALS) -> dict[str, float]:
     return most
 
 
-def mean_score(answers: dict[str, JsonObject], score: str) -> float:
+def mean_score(answers: Answers, score: str) -> float:
     return float(np.mean([facts[score] for facts in answers.values()]))
 
 
@@ -220,11 +224,11 @@ def is_same(kept: JsonObject, now: JsonObject) -> bool:
     return all(kept.get(fact) == now.get(fact) for fact in ("surfaces", "material"))
 
 
-def kept_of(name: str) -> dict[str, JsonObject]:
+def kept_of(name: str) -> Answers:
     return read_json(FOLDER / f"{name}.json")
 
 
-def write(name: str, answers: dict[str, JsonObject]) -> None:
+def write(name: str, answers: Answers) -> None:
     lines = ",\n".join(f"{json.dumps(frame)}: {json.dumps(facts)}" for frame, facts in answers.items())
     (FOLDER / f"{name}.json").write_text(f"{{\n{lines}\n}}\n", "utf-8")
 

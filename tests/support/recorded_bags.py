@@ -77,7 +77,11 @@ class Messages:
         )  # fmt: skip
 
 
-def write_bag(path: Path, ros: int, topics: Callable[[Messages], dict[str, list[Any]]]) -> Path:
+Topics = dict[str, list[Any]]
+"""Messages of each topic."""
+
+
+def write_bag(path: Path, ros: int, topics: Callable[[Messages], Topics]) -> Path:
     """``topics`` makes the messages of each topic; they are recorded a second apart."""
     make = Messages(ros)
     plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
@@ -97,7 +101,7 @@ DEPTH_MM = default_rng(0).integers(500, 2000, (3, 6, 8)).astype(np.uint16)
 DEPTH_MM[:, 0, 0] = 0
 
 
-def depth_topics(make: Messages) -> dict[str, list[Any]]:
+def depth_topics(make: Messages) -> Topics:
     color = np.zeros((6, 8), np.uint8)
     return {
         "/camera/color/image_raw": [make.image(color, "mono8")],

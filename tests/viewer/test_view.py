@@ -8,11 +8,11 @@ import signal
 import socket
 import subprocess
 import sys
-import urllib.request
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -25,6 +25,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, wall
 from toy_scene import rest_mesh, toy_scene
+from trimesh.creation import box, icosphere
 
 from mereo.__main__ import main
 from mereo.geometry.camera import PointCloud
@@ -233,7 +234,7 @@ def test_a_viser_that_starts_otherwise_is_refused(monkeypatch: pytest.MonkeyPatc
 def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object) -> None:
     port = server.get_port()  # type: ignore[attr-defined]
     assert server.get_host() == "127.0.0.1"  # type: ignore[attr-defined]
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
+    with urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
         assert answer.status == 200
     with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
         viewer_server.start_server(port)
@@ -250,7 +251,7 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
             line = process.stdout.readline()
             address = re.search(r"open (http://127\.0\.0\.1:\d+) in a browser", line)
             assert address, line
-            with urllib.request.urlopen(address[1], timeout=60) as answer:
+            with urlopen(address[1], timeout=60) as answer:
                 assert b"<html" in answer.read()
             process.send_signal(signal.SIGINT)
             assert process.wait(timeout=60) == 0
@@ -470,16 +471,16 @@ def test_our_own_glb_is_in_the_frame_of_the_input(folder: Path) -> None:
 def write_strange(path: Path) -> None:
     """GLB file of somebody else: a moved and mirrored box of vertex colours, a plain one twice, a texture, points."""
     scene = trimesh.Scene()
-    painted = trimesh.creation.box((1, 1, 1))
+    painted = box((1, 1, 1))
     painted.visual.vertex_colors = np.array([[255, 0, 0, 255]] * 4 + [[0, 0, 255, 255]] * 4, np.uint8)
     mirrored = np.diag([-1.0, 1.0, 1.0, 1.0])
     mirrored[0, 3] = 5.0
     scene.add_geometry(painted, node_name="painted", geom_name="painted", transform=mirrored)
-    plain = trimesh.creation.box((1, 1, 1))
+    plain = box((1, 1, 1))
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 0, 255])
     plain.visual = trimesh.visual.TextureVisuals(material=material)
     scene.add_geometry(plain, node_name="plain", geom_name="plain")
-    round_one = trimesh.creation.icosphere(1)
+    round_one = icosphere(1)
     picture = Image.fromarray(np.full((4, 4, 3), (0, 128, 255), np.uint8))
     round_one.visual = trimesh.visual.TextureVisuals(uv=np.full((len(round_one.vertices), 2), 0.5), image=picture)
     scene.add_geometry(round_one, node_name="round", geom_name="round")

@@ -30,13 +30,13 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.conventions import Facts, Names, WholeNumbers
 from mereo.geometry.labels import LabelGrid
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import EMPTY_MESH, Segment, SegmentedMesh
 from mereo.geometry.transforms import Vector, checked_pose, inverse_rigid, rigid, transform_points
 from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, to_json
 from mereo.io.attachments import Attachment, Content, PoseTable, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.bounds import Port, check_value
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.errors import checked_path, readable
+from mereo.io.errors import AnyPath, checked_path, readable
 from mereo.io.mesh_formats import read_glb
 from mereo.io.point_arrays import mesh_of, model_points, parts_of_scene
 from mereo.io.readers import read_arrays
@@ -44,9 +44,9 @@ from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import WRITERS, chosen_formats
 from mereo.io.writers.volumes import MM_PER_M
-from mereo.reconstruction.pipeline import Reconstruction
+from mereo.reconstruction.pipeline import Reconstruction, described
 from mereo.results.carry import carry, place
-from mereo.results.joints import JointValue, measure_joints, pose_covariance
+from mereo.results.joints import JointValue, JointValues, measure_joints, pose_covariance
 from mereo.visualization.reconstruction_report import result_html
 from mereo.visualization.result_files import (
     INSTANCE,
@@ -133,9 +133,11 @@ class SegmentResult:
         return mesh
 
     def __repr__(self) -> str:
-        sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
-        figures = f"volume {self.volume:.3g}{sure}" if self.is_present else "not found"
-        return f"SegmentResult({self.name!r}, {figures})"
+        return described(self, self.is_present)
+
+
+SegmentResults = dict[str, SegmentResult]
+"""Segments of a result by their names."""
 
 
 def _open3d_mesh(mesh: Segment) -> Any:
@@ -152,7 +154,7 @@ class SegmentedResult(ABC):
 
     @property
     @abstractmethod
-    def _segments(self) -> dict[str, SegmentResult]:
+    def _segments(self) -> SegmentResults:
         """All segments by their names."""
 
     @property
@@ -300,7 +302,7 @@ class Result(Answer, SegmentedResult):
         return None if self.registered is None else self.registered.residual
 
     @property
-    def joints(self) -> dict[str, JointValue]:
+    def joints(self) -> JointValues:
         """Value of each joint that the object's definition has by name, as a robot's file has; empty without a fit."""
         return measure_joints(self)
 
@@ -310,7 +312,7 @@ class Result(Answer, SegmentedResult):
         return None if self.registered is None else self.registered.model_scale
 
     @cached_property
-    def _segments(self) -> dict[str, SegmentResult]:
+    def _segments(self) -> SegmentResults:
         fit, parts = self.registered, self.reconstruction.segments
         sure = None if fit is None else fit.uncertainty
         radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
@@ -360,7 +362,7 @@ class Result(Answer, SegmentedResult):
         (placed,) = place([attachment], self.registrar, files)
         carried = carry(placed, registered)
         content = carried.content
-        if isinstance(what, str | Path):
+        if isinstance(what, AnyPath):
             return CarriedFile(carried.name, content, carried.inside, carried.farthest, self.seen.frame)
         if isinstance(content, PoseTable):
             assert content.rotations is not None
@@ -520,7 +522,7 @@ class CarriedFile:
 
 
 def _attachment(what: Any) -> Attachment:
-    if isinstance(what, str | Path):
+    if isinstance(what, AnyPath):
         return read_attachments([what])[0]
     if (mesh := mesh_of(what)) is not None:
         return Attachment("the mesh", Surfaces(mesh))
@@ -566,7 +568,7 @@ def registration_of(answer: Answer) -> Registration:
 
 def _segment_results(
     parts: Iterable[Any], surfaces: SegmentedMesh, radii: Facts, poses: Mapping[str, Pose]
-) -> dict[str, SegmentResult]:
+) -> SegmentResults:
     """Segments by their names, of figures as ``SegmentFacts`` has them; radii and poses are those that are known."""
     return {
         part.name: SegmentResult(
@@ -629,7 +631,7 @@ class StoredResult(SegmentedResult):
         return self, *self.further
 
     @property
-    def joints(self) -> dict[str, JointValue]:
+    def joints(self) -> JointValues:
         """As ``Result.joints``."""
         return {
             name: JointValue(
@@ -639,7 +641,7 @@ class StoredResult(SegmentedResult):
         }
 
     @cached_property
-    def _segments(self) -> dict[str, SegmentResult]:
+    def _segments(self) -> SegmentResults:
         rows = self.facts["segments"]
         radii = {row["name"]: row.get("centroid_radius95") for row in rows}
         poses = {row["name"]: np.array(row["pose"]) for row in rows if "pose" in row}
@@ -675,9 +677,8 @@ def load_result(folder: str | Path) -> StoredResult:
         facts = json.loads(summary.read_text("utf-8"))
         if grid.names != tuple(row["name"] for row in facts["segments"]) or not meshes.keys() <= set(grid.names):
             raise ValueError(f"its segments are not those of {surfaces.name} and {labels.name}")
-        empty = np.empty((0, 3)), np.empty((0, 3), np.int64)
         parts = (
-            meshes.get(row["name"], Segment(row["name"], tuple(row["color"]), *empty)) for row in facts["segments"]
+            meshes.get(row["name"], Segment(row["name"], tuple(row["color"]), *EMPTY_MESH)) for row in facts["segments"]
         )
         mesh = SegmentedMesh(tuple(parts), tuple(map(tuple, facts["nested"])))
         result = StoredResult(facts, mesh, grid)

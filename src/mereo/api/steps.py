@@ -11,7 +11,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from mereo.api.words import python_words, with_changes
 from mereo.fitting.config import AnswerMethod
@@ -21,7 +21,7 @@ from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import Positive, check_value
 from mereo.io.errors import checked_path
 from mereo.io.object_storage import ObjectPath, place_of
-from mereo.models.config import EXACT, Device, InferenceConfig
+from mereo.models.config import EXACT, Device, ExportFormat, InferenceConfig
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
 from mereo.models.weights import load_for, settings_for
@@ -100,7 +100,7 @@ def evaluate(
 
 
 def export(
-    model: Model | str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", overwrite: bool = False
+    model: Model | str | Path, output: str | Path, format: ExportFormat = "onnx", overwrite: bool = False
 ) -> Path:
     """Folder with a network as two graphs, encoder and query, for other runtimes: `mereo export`.
 
@@ -114,7 +114,7 @@ def export(
     with content unless ``overwrite``.
     """
     with python_words():
-        check_value("format", format, Literal["onnx", "torch"], "onnx")
+        check_value("format", format, ExportFormat, "onnx")
         export_weights(model, output, format, overwrite)
     return Path(output)
 

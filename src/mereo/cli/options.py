@@ -23,7 +23,7 @@ from tyro.constructors import PrimitiveConstructorSpec
 
 from mereo.geometry.conventions import Facts, Names
 from mereo.io.atomic_files import JsonObject
-from mereo.io.bounds import check_values
+from mereo.io.bounds import GROUP, check_values
 from mereo.io.config import InputConfig, MeshesConfig
 from mereo.io.errors import AnyPath
 from mereo.io.object_storage import Place, place_of
@@ -72,14 +72,13 @@ PlaceOption = Annotated[
 ]
 """Local path or URL of an object storage, of which ``Path`` would make s3:/bucket."""
 
+Paths = tuple[Path, ...]
 SceneName = Annotated[Positional[str], arg(metavar="SCENE")]
-ObjectFiles = Annotated[
-    Positional[tuple[Path, ...]], arg(metavar="OBJECT [OBJECT ...]", help_behavior_hint="(required)")
-]
+ObjectFiles = Annotated[Positional[Paths], arg(metavar="OBJECT [OBJECT ...]", help_behavior_hint="(required)")]
 DatasetFolder = Annotated[Positional[PlaceOption], arg(metavar="DATASET")]
 WeightsName = Annotated[Positional[str], arg(metavar="WEIGHTS")]
-WeightsFiles = Annotated[Positional[tuple[Path, ...]], arg(metavar="[WEIGHTS ...]", help_behavior_hint="")]
-Inputs = Annotated[Positional[tuple[Path, ...]], arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
+WeightsFiles = Annotated[Positional[Paths], arg(metavar="[WEIGHTS ...]", help_behavior_hint="")]
+Inputs = Annotated[Positional[Paths], arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
 InputOrNone = Annotated[Positional[Path | None], arg(metavar="[INPUT]", help_behavior_hint="")]
 InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
@@ -108,11 +107,11 @@ class FrameOptions:
 
     object: Names = ()
     weights: str | None = None
-    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
+    meshes: Annotated[MeshesConfig, GROUP] = field(default_factory=MeshesConfig)
     joints: Path | None = None
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    reading: Annotated[InputConfig, GROUP] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, GROUP] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, GROUP] = field(default_factory=InferenceConfig)
 
 
 def check_named(command: str, object: Sequence[str], weights: AnyPath | None) -> None:

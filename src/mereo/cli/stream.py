@@ -21,7 +21,9 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import nan
 from pathlib import Path
+from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -124,25 +126,25 @@ def stream(
     wrong in the sequence itself is raised after the outcomes before it.
     """
     source = _paced(frames) if recorded_pace else iter(frames)
-    each = ((frame, time.perf_counter(), 0) for frame in source if frame is not None)
+    each = ((frame, perf_counter(), 0) for frame in source if frame is not None)
     arriving = each if every_frame else _latest(source)
     with closing(arriving):
         for frame, arrived_s, dropped in arriving:
-            start, result, error = time.perf_counter(), None, ""
+            start, result, error = perf_counter(), None, ""
             try:
                 result = answer(frame)
             except Exception as problem:  # a damaged frame makes the libraries that parse it raise anything
                 error = frame_error(problem, frame.name)
-            now = time.perf_counter()
+            now = perf_counter()
             yield Outcome(frame.name, frame.time_s, result, error, now - arrived_s, now - start, dropped)
 
 
 def _paced(frames: Iterable[StreamFrame | None]) -> Frames:
-    start, zero = time.perf_counter(), None
+    start, zero = perf_counter(), None
     for frame in frames:
         if frame is not None:
             zero = frame.time_s if zero is None else zero
-            time.sleep(max(0.0, frame.time_s - zero - (time.perf_counter() - start)))
+            time.sleep(max(0.0, frame.time_s - zero - (perf_counter() - start)))
         yield frame
 
 
@@ -162,7 +164,7 @@ def _latest(frames: Frames) -> Generator[Arrived, None, None]:
                     with suppress(queue.Empty):
                         waiting.get_nowait()
                         dropped += 1
-                    waiting.put((frame, time.perf_counter(), dropped))
+                    waiting.put((frame, perf_counter(), dropped))
         except Exception as problem:  # raised in the caller's thread, after the outcomes before it
             end = problem
         while not is_left.is_set():
@@ -196,7 +198,7 @@ class Summary:
     failed: int = 0
     dropped: int = 0
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
-    start_s: float = field(default_factory=time.perf_counter)
+    start_s: float = field(default_factory=perf_counter)
 
     def add(self, outcome: Outcome) -> None:
         """Count an outcome."""
@@ -208,8 +210,8 @@ class Summary:
             self.latencies_s.append(outcome.latency_s)
 
     def __str__(self) -> str:
-        rate_hz = self.answered / (time.perf_counter() - self.start_s)
-        median, worst = np.quantile(self.latencies_s, [0.5, 0.99]) if self.latencies_s else (np.nan, np.nan)
+        rate_hz = self.answered / (perf_counter() - self.start_s)
+        median, worst = np.quantile(self.latencies_s, [0.5, 0.99]) if self.latencies_s else (nan, nan)
         return (
             f"{self.answered} frames answered at {rate_hz:.1f} Hz, latency {1e3 * median:.0f} ms (median), "
             f"{1e3 * worst:.0f} ms (99 %); {self.dropped} dropped for newer ones, {self.failed} bad"
@@ -324,16 +326,16 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
         raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
     if not path.is_dir() or is_recording(path):
         raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
-    folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), time.perf_counter()
+    folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), perf_counter()
 
     def arriving() -> Frames:
         while True:
-            begun = time.perf_counter()
+            begun = perf_counter()
             for file in folder.look(begun):
                 load = _loader(partial(read_frame, file, reading), isolation)
-                yield StreamFrame(file.name, time.perf_counter() - start, load)
+                yield StreamFrame(file.name, perf_counter() - start, load)
             yield None
-            time.sleep(max(LOOK_S, time.perf_counter() - begun))  # at most half of the time in a folder of many files
+            time.sleep(max(LOOK_S, perf_counter() - begun))  # at most half of the time in a folder of many files
 
     return arriving()
 
@@ -345,13 +347,13 @@ def _is_frame(file: Path, reading: InputConfig) -> bool:
 
 
 def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
-    start = time.perf_counter()
+    start = perf_counter()
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="surrogateescape")  # names are bytes: one that is no UTF-8 is still a file's
     for line in sys.stdin:
         if name := line.strip():
             load = _loader(partial(read_frame, name, reading), isolation)
-            yield StreamFrame(name, time.perf_counter() - start, load)
+            yield StreamFrame(name, perf_counter() - start, load)
 
 
 def _of_message(message: RecordedFrame, source: str, reading: InputConfig, isolation: IsolationConfig) -> StreamFrame:

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
+from math import inf
 from typing import Any
 
 import numpy as np
@@ -75,7 +76,7 @@ class Material:
             raise ValueError(
                 f"Poisson's ratio is {self.poisson:g}; it must lie between -1 and 0.5: take 0.4 for tissue"
             )
-        if not 0 < self.young < np.inf:
+        if not 0 < self.young < inf:
             raise ValueError(f"Young's modulus is {self.young:g}; it must be above 0: take 1, which changes no mode")
 
 
@@ -234,7 +235,7 @@ def scale_modes(values: PerMode, modes: Modes, motion: float, power: float = 2.0
 
     Raises ``ValueError`` for a motion that is not above 0.
     """
-    if not 0 < motion < np.inf:
+    if not 0 < motion < inf:
         raise ValueError(f"the motion is {motion:g}; it must be above 0: a tenth of half the longest side is moderate")
     amplitude = (values / values[0]) ** (-power / 2)
     return modes * (amplitude * (motion / np.sqrt((amplitude**2).sum())))

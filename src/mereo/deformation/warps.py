@@ -6,6 +6,7 @@ SIGGRAPH 1984. Lengths share one unit, angles are in radians; notation as in ``m
 """
 
 from dataclasses import dataclass
+from math import pi
 
 import numpy as np
 from jaxtyping import Float
@@ -56,7 +57,7 @@ class Bend:
         s = np.clip(along, 0.0, self.length)
         angle = s * (self.angle_rad / self.length)
         # of the arc: (sin a / k, (1 - cos a) / k), written so that it holds for curvature zero
-        half = np.sinc(angle / (2 * np.pi))
+        half = np.sinc(angle / (2 * pi))
         x, y = s * half * np.cos(angle / 2), s * half * np.sin(angle / 2)
         cosine, sine, beyond = np.cos(angle), np.sin(angle), along - s
         new_along = x + beyond * cosine - offset * sine
@@ -156,9 +157,9 @@ class SmoothField:
     def sample(cls, rng: Generator, strength: float, wavelength: Range, modes: int = 4) -> "SmoothField":
         """Field of ``modes`` random waves, wavelengths uniform in a range, with gradient bound ``strength``."""
         directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
-        frequencies = unit_rows(directions) * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
+        frequencies = unit_rows(directions) * 2 * pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
         shares = norm(amplitudes, axis=1) @ norm(frequencies, axis=1)
-        phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=modes)
+        phases = named(rng, "phase", "rad").uniform(0, 2 * pi, size=modes)
         return cls(amplitudes * (strength / shares), frequencies, phases)
 
     def __call__(self, points: Points) -> Points:

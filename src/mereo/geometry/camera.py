@@ -5,6 +5,7 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 """
 
 from dataclasses import dataclass, replace
+from math import inf
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -65,7 +66,7 @@ class Camera:
                 f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"
             )
         check_real(np.array([self.focal_x_px, self.focal_y_px, self.center_x_px, self.center_y_px]), "the camera")
-        if not (0 < self.focal_x_px < np.inf and 0 < self.focal_y_px < np.inf):
+        if not (0 < self.focal_x_px < inf and 0 < self.focal_y_px < inf):
             raise ValueError(
                 f"focal length is {self.focal_x_px} x {self.focal_y_px} pixels; both must be positive: "
                 "check the intrinsics file"
@@ -242,7 +243,7 @@ class SharedNoise(NamedTuple):
         pixel: angle between neighbouring pixels of the camera.
     """
 
-    std: float = np.inf
+    std: float = inf
     side: float = 0.0
     pixel: float = 0.0
 

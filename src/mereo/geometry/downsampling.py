@@ -1,5 +1,7 @@
 """Fewer points of a cloud: at random, evenly in space, or means of neighbours."""
 
+from math import inf
+
 import numpy as np
 from jaxtyping import Float, Real, Shaped
 from numpy import ndarray
@@ -98,7 +100,7 @@ def spacing(points: Points) -> float:
     """Median distance from a point to its nearest neighbour at another place; 0 where all coincide."""
     sample = points[:: max(1, len(points) // 1000)]  # whose median is good to a few percent
     distance = cKDTree(points).query(sample, k=min(8, len(points)))[0].reshape(len(sample), -1)
-    apart = np.where(distance > 0, distance, np.inf).min(axis=1)
+    apart = np.where(distance > 0, distance, inf).min(axis=1)
     return float(np.median(apart[np.isfinite(apart)])) if np.isfinite(apart).any() else 0.0
 
 
@@ -129,7 +131,7 @@ def farthest_point_order(points: Real[ndarray, "n 3"], count: int) -> Subset:
     # buffers are reused and every operation is one pass, because m passes over n points dominate
     order = np.empty(m, np.int64)
     difference, square = np.empty_like(xyz), np.empty_like(xyz[0])
-    distance = np.full(xyz.shape[1], np.inf, np.float32)
+    distance = np.full(xyz.shape[1], inf, np.float32)
     for i in range(m):
         order[i] = current
         np.subtract(xyz, xyz[:, current : current + 1], out=difference)

@@ -6,6 +6,7 @@ part of the data: they travel through datasets, weights and every export, so a l
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -37,6 +38,9 @@ Faces = Int[ndarray, "f 3"]
 
 AnyFaces = Int[ndarray, "_ 3"]
 """The same, as many as there are: of a mesh that is changed, with ``AnyPoints``."""
+
+EMPTY_MESH = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+"""That of a segment which was not found."""
 
 ChangedMesh = tuple[Float[ndarray, "w 3"], Int[ndarray, "g 3"]]
 """Vertices and faces of a mesh that comes of another one, in numbers of their own."""
@@ -107,7 +111,7 @@ class Segment:
     @property
     def bounds(self) -> Corners:
         """Lower and upper corner of the axis-aligned box; infinite, upside down, without vertices."""
-        return np.stack([self.vertices.min(axis=0, initial=np.inf), self.vertices.max(axis=0, initial=-np.inf)])
+        return np.stack([self.vertices.min(axis=0, initial=inf), self.vertices.max(axis=0, initial=-inf)])
 
     @property
     def volume(self) -> float:

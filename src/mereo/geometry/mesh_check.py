@@ -3,12 +3,14 @@
 from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import combinations
+from math import inf
 from typing import NamedTuple
 
 import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from manifold3d import Manifold
 from numpy import ndarray
 from numpy.linalg import norm, svd
 
@@ -237,7 +239,7 @@ def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Boo
     """Faces of pieces that are tiny compared with the whole, and a phrase with their number, share, size and place."""
     piece = pieces(faces, len(vertices))
     corners = vertices[faces]
-    low, high = (np.full((piece.max() + 1, 3), end) for end in (np.inf, -np.inf))
+    low, high = (np.full((piece.max() + 1, 3), end) for end in (inf, -inf))
     np.minimum.at(low, piece, corners.min(axis=1))
     np.maximum.at(high, piece, corners.max(axis=1))
     size = norm(high - low, axis=1)
@@ -265,17 +267,17 @@ PLAUSIBLE_M = (0.005, 5.0)
 """Longest side of what a depth camera looks at: from 5 mm to 5 m."""
 
 
-def solid_of(vertices: AnyPoints, faces: AnyFaces) -> manifold3d.Manifold:
+def solid_of(vertices: AnyPoints, faces: AnyFaces) -> Manifold:
     """Solid of a closed mesh; raises ``ValueError`` where manifold3d does not accept it."""
     # copies, because manifold3d takes no array that is read-only
     mesh = manifold3d.Mesh64(np.array(vertices, np.float64, order="C"), np.array(faces, np.uint64, order="C"))
-    solid = manifold3d.Manifold(mesh)
+    solid = Manifold(mesh)
     if solid.status() != manifold3d.Error.NoError:
         raise ValueError(f"a mesh of {len(faces)} faces is no solid ({solid.status().name}); it must be closed")
     return solid
 
 
-def mesh_of(solid: manifold3d.Manifold) -> AnyMesh:
+def mesh_of(solid: Manifold) -> AnyMesh:
     """Vertices and faces of a solid."""
     mesh = solid.to_mesh64()
     return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, np.int64)
@@ -289,7 +291,7 @@ def united(pieces: Sequence[Segment]) -> AnyMesh:
         solids = [solid_of(piece.vertices, piece.faces) for piece in pieces]
         if min(solid.volume() for solid in solids) <= 0:
             raise ValueError("a piece is inside out, and would be cut off the others")
-        return mesh_of(manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add))
+        return mesh_of(Manifold.batch_boolean(solids, manifold3d.OpType.Add))
     except ValueError:
         return SegmentedMesh(tuple(pieces)).merged()[:2]
 
@@ -354,7 +356,7 @@ class _Body:
         self.axes = [low[k] + (np.arange(CELLS) + 0.5) * (high[k] - low[k]) / CELLS for k in range(3)]
 
     @cached_property
-    def solid(self) -> manifold3d.Manifold | None:
+    def solid(self) -> Manifold | None:
         """The solid; None where the mesh is none, or none for manifold3d."""
         if not self.segment.solid:
             return None

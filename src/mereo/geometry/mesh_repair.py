@@ -9,9 +9,9 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import igl
-import manifold3d
 import numpy as np
 from jaxtyping import Bool, Int
+from manifold3d import Manifold, OpType
 from numpy import ndarray
 from numpy.linalg import norm
 from scipy.spatial import cKDTree
@@ -172,7 +172,7 @@ def _unite(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
         return vertices, faces, ""
     filled = [shell for shell in shells if shell.volume() > 0]
     hollow = [solid_of(v, f[:, ::-1]) for v, f in (mesh_of(shell) for shell in shells if shell.volume() < 0)]
-    united = manifold3d.Manifold.batch_boolean(filled, manifold3d.OpType.Add)
+    united = Manifold.batch_boolean(filled, OpType.Add)
     outside = [shell for shell in hollow if (shell ^ united).volume() < 0.5 * shell.volume()]
     for shell in hollow:
         united = united + shell if shell in outside else united - shell
@@ -291,7 +291,7 @@ NEIGHBOURS = np.argwhere(np.triu(np.abs(NODES[:, None] - NODES).sum(axis=2) == 1
 """Pairs of nodes of a block."""
 
 
-def _even_surface(body: _Body) -> manifold3d.Manifold:
+def _even_surface(body: _Body) -> Manifold:
     """Surface from cells of one size."""
     shape = np.ceil(body.vertices.max(axis=0) + 2.5 - 1e-9).astype(int)
     blocks = -(-shape // 4)
@@ -299,16 +299,14 @@ def _even_surface(body: _Body) -> manifold3d.Manifold:
     inside = body.inside_blocks(first, 1.0).reshape(*blocks, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
     inside = inside.reshape(4 * blocks)[: shape[0], : shape[1], : shape[2]]
     if not inside.any():
-        return manifold3d.Manifold()
+        return Manifold()
     nodes = np.argwhere(nodes_of(changing_cells(inside)))
     field = np.where(inside, 1.0, -1.0)
     field[tuple(nodes.T)] *= np.clip(body.distance(nodes.astype(float)), 1e-3, 1)
     return solid_of(*zero_surface(field)).simplify(0.2)
 
 
-def _with_thin_parts(
-    body: _Body, solid: manifold3d.Manifold
-) -> tuple[manifold3d.Manifold, float, tuple[float, Vector] | None]:
+def _with_thin_parts(body: _Body, solid: Manifold) -> tuple[Manifold, float, tuple[float, Vector] | None]:
     """Solid with finer cells where the old surface is far from it; the least cell; the most still lost, and where.
 
     What is thin breaks into dashes before it vanishes. They are near it, so shells of few cells do not count.
@@ -330,8 +328,8 @@ def _with_thin_parts(
             blocks = _blocks(places[chosen], way[chosen], 16 * finer, FINER * finer)
             if len(blocks) > MOST_BLOCKS:  # of finer cells there would be even more
                 blocks, last = blocks[:MOST_BLOCKS], level + 1
-            cube, corners = manifold3d.Manifold.cube((16 * finer,) * 3), (blocks * 16 * finer).tolist()
-            region = manifold3d.Manifold.batch_boolean([cube.translate(c) for c in corners], manifold3d.OpType.Add)
+            cube, corners = Manifold.cube((16 * finer,) * 3), (blocks * 16 * finer).tolist()
+            region = Manifold.batch_boolean([cube.translate(c) for c in corners], OpType.Add)
             solid, cell = (whole - region) + (_fine_surface(body, blocks, finer) ^ region), finer
     worst = int(np.where(seeds, way, -1.0).argmax())
     lost = (float(way[worst]), places[worst]) if seeds.any() else None
@@ -343,11 +341,11 @@ def _within(places: AnyPoints, of: AnyPoints, distance: float) -> Flags:
     return cKDTree(of).query(places, distance_upper_bound=distance)[0] < distance
 
 
-def _without_specks(solid: manifold3d.Manifold, side: float) -> manifold3d.Manifold:
+def _without_specks(solid: Manifold, side: float) -> Manifold:
     """Solid without shells and cavities of less volume than a cube of a side."""
     shells = solid.decompose()
     kept = [shell for shell in shells if abs(shell.volume()) > side**3]
-    return solid if len(kept) == len(shells) else manifold3d.Manifold.compose(kept)
+    return solid if len(kept) == len(shells) else Manifold.compose(kept)
 
 
 def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[ndarray, "b 3"]:
@@ -359,7 +357,7 @@ def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[n
     return blocks[np.argsort(first)]
 
 
-def _fine_surface(body: _Body, blocks: Int[ndarray, "b 3"], cell: float) -> manifold3d.Manifold:
+def _fine_surface(body: _Body, blocks: Int[ndarray, "b 3"], cell: float) -> Manifold:
     """Surface within blocks of 16 x 16 x 16 cells and one cell around; it is closed along their outside."""
     parts = (4 * blocks[:, None] + np.indices((5, 5, 5)).reshape(3, -1).T).reshape(-1, 3)
     first = 4 * np.unique(parts, axis=0) - 1
@@ -377,14 +375,14 @@ def _fine_surface(body: _Body, blocks: Int[ndarray, "b 3"], cell: float) -> mani
     corners = corners[(count > 0) & (count < 8)]
     used, corners = np.unique(corners, return_inverse=True)
     if len(used) == 0:
-        return manifold3d.Manifold()
+        return Manifold()
     places = nodes[used] * cell
     field = np.clip(body.distance(places), 1e-3 * cell, cell) * np.where(inside[used], 1.0, -1.0)
     vertices, faces = igl.marching_cubes(field, places, corners.reshape(-1, 8).astype(np.int64), 0.0)[:2]
     return solid_of(vertices, faces.astype(np.int64)).simplify(0.2 * cell)
 
 
-def _cut_off(body: _Body, solid: manifold3d.Manifold, places: AnyPoints, normals: AnyPoints) -> tuple[Values, Flags]:
+def _cut_off(body: _Body, solid: Manifold, places: AnyPoints, normals: AnyPoints) -> tuple[Values, Flags]:
     """Distances from a new solid, and whether a place lies far out of it; a narrow gap that it closes is no loss."""
     if solid.is_empty():
         return np.full(len(places), np.inf), np.ones(len(places), bool)

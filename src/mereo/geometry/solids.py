@@ -10,6 +10,7 @@ is the depth and a direction's x and y are its slopes.
 """
 
 from functools import cached_property
+from math import inf
 from typing import NamedTuple
 
 import igl
@@ -217,7 +218,7 @@ class Solids:
         outside = (np.maximum(np.maximum(each.low - points, points - each.high), 0.0) for each in self._solids)
         bounds = np.stack([np.einsum("ij,ij->i", offset, offset) for offset in outside])
         likely = bounds.argmin(axis=0)
-        squared, place = np.full(len(points), np.inf), np.empty_like(points)
+        squared, place = np.full(len(points), inf), np.empty_like(points)
         face, owner = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
         first_faces = np.cumsum([0, *(len(solid.faces) for solid in self._solids)])
         # first the segment whose box is nearest, then those whose boxes are nearer than what it gave: one to two each
@@ -233,7 +234,7 @@ class Solids:
 
     def first_hit(self, directions: Points) -> Hits:
         """First meetings of rays ``t * direction`` from the origin with any surface, t > 0; directions have z = 1."""
-        hits = Hits(np.full(len(directions), np.inf), np.zeros((len(directions), 3)))
+        hits = Hits(np.full(len(directions), inf), np.zeros((len(directions), 3)))
         for solid in self._solids:
             hits.nearer(*solid.first_hit(directions))
         return hits

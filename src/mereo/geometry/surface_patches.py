@@ -7,6 +7,8 @@ right at it in space, where it turns away from the camera, is its own. Measured 
 Notation: n points, k neighbours.
 """
 
+from math import nan
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy import ndarray
@@ -204,7 +206,7 @@ def second_differences(depth: PixelValues, lag: int) -> PixelValues:
 
     Along planes inverse depth is linear in the picture, so that they are 0 but for noise.
     """
-    inverse, second = np.full(depth.shape, np.nan), np.full(depth.shape, np.nan)
+    inverse, second = np.full(depth.shape, nan), np.full(depth.shape, nan)
     np.divide(1.0, depth, out=inverse, where=depth > 0)
     second[:, lag:-lag] = inverse[:, : -2 * lag] - 2 * inverse[:, lag:-lag] + inverse[:, 2 * lag :]
     return second

@@ -7,6 +7,7 @@ principal axes: a symmetry keeps both. Lengths are those of the mesh.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import pi
 
 import igl
 import numpy as np
@@ -100,24 +101,24 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
     center, moments, axes = surface.moments()
     alike = np.diff(moments) <= ALIKE_MOMENTS * moments[1:]
     if not alike.any():
-        return _settled(surface, center, np.pi * axes)
+        return _settled(surface, center, pi * axes)
     if alike.all():
         turns = Rotation.random(600, rng=default_rng(0)).as_rotvec()
-        halves = [surface.settle(_about(center, np.pi * axis)) for axis in axes]
+        halves = [surface.settle(_about(center, pi * axis)) for axis in axes]
         middle = _fixed_point(halves)
         if np.mean([surface.is_kept(_about(middle, turn)) for turn in turns[:100]]) >= NEARLY:
             whole = _about(middle, turns[0])
             return (Symmetry(whole, None, None, surface.landing(whole)),)
         return _settled(surface, center, turns)
-    main, around = axes[0 if alike[1] else 2], np.arange(1, round(2 * np.pi / STEP)) * STEP
-    half = surface.settle(_about(center, np.pi * main))
+    main, around = axes[0 if alike[1] else 2], np.arange(1, round(2 * pi / STEP)) * STEP
+    half = surface.settle(_about(center, pi * main))
     axis, middle = _axis_of(half), _fixed_point([half])
     if np.mean([surface.is_kept(_about(middle, angle * axis)) for angle in around]) >= NEARLY:
         whole = _about(middle, axis)  # by 1 rad, which nothing but a round part inside survives
-        return (Symmetry(whole, None, axis, surface.landing(whole)), *_settled(surface, middle, np.pi * axes[1:2]))
-    between = np.arange(round(np.pi / STEP))[:, None] * STEP
+        return (Symmetry(whole, None, axis, surface.landing(whole)), *_settled(surface, middle, pi * axes[1:2]))
+    between = np.arange(round(pi / STEP))[:, None] * STEP
     across = np.cos(between) * axes[1] + np.sin(between) * np.cross(main, axes[1])
-    return _settled(surface, center, np.concatenate([around[:, None] * main, np.pi * across]))
+    return _settled(surface, center, np.concatenate([around[:, None] * main, pi * across]))
 
 
 def describe_symmetries(symmetries: Sequence[Symmetry], names: Names, of_segments: bool = False) -> list[str]:

@@ -85,6 +85,10 @@ ShareRange = Annotated[tuple[float, float], *_within(0, 1, above=True)]
 Instances = Annotated[int | Literal["all"], *_within(1)]  # of an object in a whole frame
 
 
+GROUP = arg(name="")
+"""Of settings whose options are called as their fields, without a prefix."""
+
+
 _kinds = lru_cache(maxsize=64)(partial(get_type_hints, include_extras=True))
 
 

@@ -607,7 +607,11 @@ def read_pose(path: Path) -> Transform:
         return checked_pose(content["pose"] if isinstance(content, dict) else content)
 
 
-def read_arrays(path: Path) -> dict[str, ndarray]:
+Arrays = dict[str, ndarray]
+"""Arrays by their names."""
+
+
+def read_arrays(path: Path) -> Arrays:
     """All arrays of an NPZ file; raises ``SizeError``, and whatever damage makes of the parser."""
     with limited_memory(path), path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
         arrays = {key: file[key] for key in file.files}

@@ -6,11 +6,11 @@ The image is that of the depth camera, in metres by the unit that the device sta
 the colour camera sees it, with the intrinsics of that. Images are copied as they come, for the library has few buffers.
 """
 
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
@@ -104,7 +104,7 @@ def _serials(rs: Any) -> list[str]:
 
 
 def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Iterator[RecordedFrame | None]:
-    topic, time_s, arrived_s = f"{REALSENSE} {Path(name).name}", 0.0, time.monotonic()
+    topic, time_s, arrived_s = f"{REALSENSE} {Path(name).name}", 0.0, monotonic()
     camera: Camera | None = None
     before: tuple[Any, float] | None = None
     try:
@@ -113,7 +113,7 @@ def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Ite
             if depth is None:
                 if playback is not None and playback.current_status() == rs.playback_status.stopped:
                     return
-                if playback is None and time.monotonic() - arrived_s >= SILENT_S:
+                if playback is None and monotonic() - arrived_s >= SILENT_S:
                     raise _silence(name, name in _serials(rs))
                 yield None
                 continue
@@ -123,8 +123,8 @@ def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Ite
             stamp = depth.get_frame_timestamp_domain(), depth.get_timestamp()
             if before is not None:  # the first frames may be stamped by another clock
                 is_same = stamp[0] == before[0]
-                time_s += max(0.0, stamp[1] - before[1]) / 1e3 if is_same else time.monotonic() - arrived_s
-            before, arrived_s = stamp, time.monotonic()
+                time_s += max(0.0, stamp[1] - before[1]) / 1e3 if is_same else monotonic() - arrived_s
+            before, arrived_s = stamp, monotonic()
             yield RecordedFrame(topic, time_s, partial(_depth_image, image, float(depth.get_units()), camera))
     finally:
         with suppress(RuntimeError):  # of a camera that is gone

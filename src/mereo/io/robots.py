@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
+from math import inf, nan, pi
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
@@ -20,7 +21,7 @@ from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.conventions import LARGEST, Names, Range, Texts
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color
+from mereo.geometry.mesh import PALETTE, AnyMesh, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
 from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.config import RobotMeshes
@@ -280,7 +281,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
             name = joint.name or f"joint {number}"
             kind = kinds.get(int(model.jnt_type[number]))
             if kind is not None:
-                lower, upper = joint.range if model.jnt_limited[number] else (-np.inf, np.inf)
+                lower, upper = joint.range if model.jnt_limited[number] else (-inf, inf)
                 limit = yourdfpy.Limit(lower=float(lower), upper=float(upper))
                 mimic = _mjcf_mimic(model, mujoco, yourdfpy, number)
                 each = yourdfpy.Joint(name, kind, axis=data.xaxis[number].copy(), limit=limit, mimic=mimic)
@@ -376,7 +377,7 @@ class _Shape(NamedTuple):
     content: trimesh.Trimesh | Path
     scale: Vector | None = None
 
-    def surfaces(self) -> Iterator[tuple[ndarray, ndarray]]:
+    def surfaces(self) -> Iterator[AnyMesh]:
         """Vertices and faces of its parts in its own frame."""
         if isinstance(self.content, Path):
             assert self.scale is not None
@@ -508,9 +509,9 @@ def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, fl
 def _range(path: Path, joint: Any) -> Range:
     """Least and greatest value of a joint that follows none: of one that turns, at most a turn."""
     limits = (None, None) if joint.limit is None else (joint.limit.lower, joint.limit.upper)
-    least, most = (np.nan, np.nan) if limits == (None, None) else (limits[0] or 0.0, limits[1] or 0.0)
-    if joint.type == "continuous" or (joint.type == "revolute" and most - least > 2 * np.pi):
-        return -np.pi, np.pi
+    least, most = (nan, nan) if limits == (None, None) else (limits[0] or 0.0, limits[1] or 0.0)
+    if joint.type == "continuous" or (joint.type == "revolute" and most - least > 2 * pi):
+        return -pi, pi
     if joint.type != "fixed" and not 0 <= most - least < LARGEST:
         raise ValueError(
             f"{path}: joint {joint.name!r} has the limits {least:g} and {most:g}; it must have two, the lower first: "

@@ -18,7 +18,7 @@ from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Elements
 from mereo.geometry.transforms import AnyPoints, Indices, Points, longest_side
 from mereo.io.errors import readable
-from mereo.io.readers import read_arrays
+from mereo.io.readers import Arrays, read_arrays
 from mereo.io.vtk_frames import (
     COLLECTION_SUFFIXES,
     DISPLACEMENTS,
@@ -272,7 +272,7 @@ def _archive(path: Path, names: Names) -> TetrahedralRecord | SurfaceRecord:
     return SurfaceRecord(vertices, rest, _numbered(next(iter(lengths.values()))))
 
 
-def _tetrahedral(path: Path, arrays: dict[str, ndarray]) -> TetrahedralRecord:
+def _tetrahedral(path: Path, arrays: Arrays) -> TetrahedralRecord:
     if unknown := sorted(set(arrays) - set(TETRAHEDRAL)):
         raise ValueError(
             f"{path} has the array {unknown[0]!r}; known are {', '.join(TETRAHEDRAL)}: remove or rename it"
@@ -293,7 +293,7 @@ def _tetrahedral(path: Path, arrays: dict[str, ndarray]) -> TetrahedralRecord:
     return TetrahedralRecord(rest, elements, moved - rest if key == "nodes" else moved, frames)
 
 
-def _volume(path: Path, arrays: dict[str, ndarray]) -> tuple[Points, Elements]:
+def _volume(path: Path, arrays: Arrays) -> tuple[Points, Elements]:
     """Nodes and tetrahedra of an archive."""
     rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(float)
     elements = arrays["tetrahedra"]
@@ -373,7 +373,7 @@ def _surface(folder: Path, name: str) -> SurfaceRecord:
     return SurfaceRecord({name: nodes}, {name: record.rest_nodes}, record.frames)
 
 
-def _check_topology(path: Path, states: dict[str, ndarray]) -> None:
+def _check_topology(path: Path, states: Arrays) -> None:
     """Raise ``ValueError`` where states have other numbers of vertices than the first of them."""
     first = next(iter(states))
     for state, vertices in states.items():

@@ -7,11 +7,10 @@ appendix B) unless a comment says otherwise; what it leaves open is chosen as do
 from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Any, Literal
 
-from tyro.conf import arg
-
 from mereo.geometry.conventions import Facts, WholeNumbers
 from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import (
+    GROUP,
     Count,
     CountOrNone,
     Depth,
@@ -29,6 +28,9 @@ from mereo.io.bounds import (
     check_bounds,
     check_values,
 )
+
+ExportFormat = Literal["onnx", "torch"]
+"""For ONNX Runtime, or of torch.export."""
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -241,11 +243,11 @@ class NetworkConfig:
     encoder: Encoder = "pointnet2"
     points: Points = 1024
     # empty names keep the options --network.width, --network.mlp1 and so on, without those of the parts
-    pointnet2: Annotated[PointNet2Config, arg(name="")] = PointNet2Config()
-    transformer: Annotated[PointTransformerConfig, arg(name="")] = PointTransformerConfig()
-    autodecoder: Annotated[AutodecoderConfig, arg(name="")] = AutodecoderConfig()
-    decoder: Annotated[DecoderConfig, arg(name="")] = DecoderConfig()
-    additions: Annotated[AdditionsConfig, arg(name="")] = AdditionsConfig()
+    pointnet2: Annotated[PointNet2Config, GROUP] = PointNet2Config()
+    transformer: Annotated[PointTransformerConfig, GROUP] = PointTransformerConfig()
+    autodecoder: Annotated[AutodecoderConfig, GROUP] = AutodecoderConfig()
+    decoder: Annotated[DecoderConfig, GROUP] = DecoderConfig()
+    additions: Annotated[AdditionsConfig, GROUP] = AdditionsConfig()
 
     def __post_init__(self) -> None:
         check_bounds(self, "network.")

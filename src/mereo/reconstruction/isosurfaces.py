@@ -17,7 +17,7 @@ from numpy import ndarray
 from mereo.geometry.conventions import GridShape
 from mereo.geometry.labels import GridLabels, LabelGrid, VoxelMask, part_of_grid
 from mereo.geometry.marching_cubes import CellFlags, changing_cells, nodes_of, on_both_sides, over_corners, zero_surface
-from mereo.geometry.mesh import AnyMesh, Color, Nested, Segment, SegmentedMesh
+from mereo.geometry.mesh import EMPTY_MESH, AnyMesh, Color, Nested, Segment, SegmentedMesh
 from mereo.geometry.transforms import Corners, Points, Rows, Subset, Vector, longest_side
 
 GridRows = Int[ndarray, "x y z"]
@@ -243,8 +243,7 @@ def extract(
     origin, spacing, shape = _grid(box, resolution)
     sampled = (sample_dense if dense else sample_coarse_to_fine)(field, origin, spacing, shape)
     grid = LabelGrid(sampled.labels, origin, spacing, tuple(names))
-    nothing = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-    empty = SegmentedMesh(tuple(Segment(*named, *nothing) for named in zip(names, colors, strict=True)), nested)
+    empty = SegmentedMesh(tuple(Segment(*named, *EMPTY_MESH) for named in zip(names, colors, strict=True)), nested)
     surfaces = [
         _surface(sampled, grid, [index + 1, *(inner + 1 for inner, outer in empty.nesting if outer == index)])
         for index in range(len(names))
@@ -332,7 +331,7 @@ def _grown(box: Corners, sides: Bool[ndarray, "2 3"], fraction: float) -> Corner
 def _surface(sampled: Sampled, grid: LabelGrid, held: list[int]) -> AnyMesh:
     """Vertices and faces around ``held``, a label and those nested in it; none where the first does not occur."""
     if not (sampled.labels == held[0]).any():
-        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        return EMPTY_MESH
     occupied = np.argwhere(np.isin(sampled.labels, held))
     low = np.maximum(occupied.min(axis=0) - 1, 0)
     part = tuple(slice(a, b) for a, b in zip(low, occupied.max(axis=0) + 2, strict=True))

@@ -6,6 +6,7 @@ SensorFrame -find_object-> Observation (the object's points, and what each step 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from math import pi
 from pathlib import Path
 
 import numpy as np
@@ -373,7 +374,7 @@ def hidden_share(points: Points) -> float:
     spread = (ordered - np.where(is_near, near, far)).std(axis=1, keepdims=True)
     pitch = np.median(angle[:, 4])  # the fourth neighbour of a pixel is one pitch away, as the first is
     is_behind = (distance[probes, None] > edge) & (gap > STEEPEST * pitch * edge) & (gap > STEP * spread)
-    turns = np.linspace(0, 2 * np.pi, RING, endpoint=False)
+    turns = np.linspace(0, 2 * pi, RING, endpoint=False)
     ahead = (flat[ring] - flat[probes, None]) @ np.stack([np.cos(turns), np.sin(turns)]) > 0
     is_closed = (ahead & (distance[ring] <= edge)[..., None]).any(axis=1).all(axis=1)
     return float((is_behind[:, 0] & is_closed).mean())
@@ -560,7 +561,7 @@ def shared_side(noise: PixelValues) -> float:
     alike = [(products[line] / np.maximum(pairs[line], 1.0))[1:most] for line in (np.s_[0], np.s_[:, 0])]
     together = np.mean(alike, axis=0)
     along = np.arange(1, 1 + int(np.argmax(np.append(together, -np.inf) < ALIKE * together[0])))
-    return float(np.sqrt(2 * np.pi * along @ together[: len(along)] / together[0]))
+    return float(np.sqrt(2 * pi * along @ together[: len(along)] / together[0]))
 
 
 def _evenly(u: Indices, v: Indices, distance: Values, limit: int) -> Flags:

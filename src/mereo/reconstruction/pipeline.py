@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -35,6 +36,9 @@ SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 
 CONFIDENCE_VOXELS = 2000
 """Most voxels of a segment over which its confidence is a mean."""
+
+Seconds = dict[str, float]
+"""Seconds of each stage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +66,14 @@ class SegmentFacts:
     components: int
 
     def __repr__(self) -> str:
-        sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
-        figures = f"volume {self.volume:.3g}{sure}" if self.voxels else "not found"
-        return f"SegmentFacts({self.name!r}, {figures})"
+        return described(self, self.voxels > 0)
+
+
+def described(part: Any, is_present: bool) -> str:
+    """One line for a segment in figures: its name, and its volume and confidence where it was found."""
+    sure = "" if np.isnan(part.confidence) else f", confidence {part.confidence:.2f}"
+    figures = f"volume {part.volume:.3g}{sure}" if is_present else "not found"
+    return f"{type(part).__name__}({part.name!r}, {figures})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +99,7 @@ class Reconstruction:
     surfaces: SegmentedMesh
     labels: LabelGrid
     segments: tuple[SegmentFacts, ...]
-    timings_s: dict[str, float]
+    timings_s: Seconds
     evaluated: int
     clipped: bool
     code: EncodedCloud | None
@@ -155,7 +164,7 @@ class EncodedFrame:
     axes: CloudAxes
     T_camera_input: Transform
     code: EncodedCloud | None
-    timings_s: dict[str, float]
+    timings_s: Seconds
 
     @property
     def points(self) -> Points:
@@ -175,7 +184,7 @@ def encode_frame(reading: Reading, model: Trained | None, axes: CloudAxes = "cam
     """
     points = reading.cloud.points
     T_camera_input = into_camera(points, axes)
-    seconds = dict[str, float]()
+    seconds = Seconds()
     seen = reading.cloud.transformed(T_camera_input)
     if model is None:
         checked_points(seen)
@@ -227,7 +236,7 @@ def extract(seen: EncodedFrame, model: Trained, resolution: int = 128, label_poi
 
 
 @contextmanager
-def timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+def timed(timings: Seconds, stage: str) -> Iterator[None]:
     """Add the seconds of a block to ``timings`` under the name of its stage."""
     start = time.perf_counter()
     yield

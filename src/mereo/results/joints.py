@@ -8,6 +8,7 @@ uncertainty is known.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from math import inf, pi
 from typing import Literal
 from weakref import WeakKeyDictionary
 
@@ -29,7 +30,7 @@ from mereo.geometry.transforms import Indices, fit_rigid, transform_points
 from mereo.io.atomic_files import JsonObject
 from mereo.scenes.scene import AssetUnavailable, Scene
 
-SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
+SHOWN = {"rad": (180 / pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
 """Factor and name of the units in which people read values."""
 
 
@@ -69,7 +70,11 @@ class JointValue:
         return asdict(self)
 
 
-def measure_joints(answer: Answer) -> dict[str, JointValue]:
+JointValues = dict[str, JointValue]
+"""Values by the names of joints."""
+
+
+def measure_joints(answer: Answer) -> JointValues:
     """Measure the joints that have names in the object's definition, by which they are counted, in an answer's state.
 
     Empty where there are none, and where the network answers. Those of a registration are measured once.
@@ -83,10 +88,10 @@ def measure_joints(answer: Answer) -> dict[str, JointValue]:
     return _MEASURED.get(fitted, {})
 
 
-_MEASURED = WeakKeyDictionary[Registration, dict[str, JointValue]]()
+_MEASURED = WeakKeyDictionary[Registration, JointValues]()
 
 
-def _measured(registration: Registration, scene: Scene | None) -> dict[str, JointValue]:
+def _measured(registration: Registration, scene: Scene | None) -> JointValues:
     motion = None if scene is None else scene.sample_deformations
     if scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
         return {}
@@ -94,7 +99,7 @@ def _measured(registration: Registration, scene: Scene | None) -> dict[str, Join
     rows = np.unique(np.concatenate([anchors[:: 1 + len(anchors) // 64] for anchors in registration.model.anchors]))
     fit = _fit_shares(registration, motion, leaders, rows)
     reach = _reach(registration, fit, rows)
-    values = dict[str, JointValue]()
+    values = JointValues()
     for name, (joint, _) in motion.joints.items():
         index = leaders.index(joint.follows or name)
         leader = motion.joints[leaders[index]][0]
@@ -104,9 +109,9 @@ def _measured(registration: Registration, scene: Scene | None) -> dict[str, Join
         value = ends[0] + float(fit.x[index]) * (ends[1] - ends[0])
         off = None if reach is None else abs(ends[1] - ends[0]) * float(reach[index])
         if joint.turns:  # a whole turn more is the same state
-            turn = 2 * np.pi * float(np.round((value - (first + second) / 2) / (2 * np.pi)))
+            turn = 2 * pi * float(np.round((value - (first + second) / 2) / (2 * pi)))
             value, ends = value - turn, [end - turn for end in ends]
-        low, high = (-np.inf, np.inf) if leader.shares == WHOLE else sorted(ends)
+        low, high = (-inf, inf) if leader.shares == WHOLE else sorted(ends)
         interval = None if off is None else (max(value - off, low), min(value + off, high))
         values[name] = JointValue(value, interval, unit, (min(first, second), max(first, second)))  # type: ignore[arg-type]
     return values
@@ -135,7 +140,7 @@ def _fit_shares(
     starts = [np.full(len(leaders), 0.5), (at_rest - least) / np.maximum(most - least, 1e-9)]  # the middle, and rest
     if drawn is not None and len(drawn.z) == len(leaders):
         starts = [ndtr(drawn.z)]
-    free = np.where([joint.shares == WHOLE for joint in joints], np.inf, 0.0)
+    free = np.where([joint.shares == WHOLE for joint in joints], inf, 0.0)
     fits = (least_squares(misfit, np.clip(start, -free, 1 + free), bounds=(-free, 1 + free)) for start in starts)
     return min(fits, key=lambda fit: float(fit.cost))
 

@@ -45,7 +45,11 @@ WITNESSES = 8
 """Number of material points whose positions are in the file."""
 
 
-def _rigid(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+Rounded = tuple[tuple[float, ...], ...]
+"""Rows of numbers as a file has them."""
+
+
+def _rigid(rows: Rounded) -> Rounded:
     if not is_rigid(np.array(rows)):
         raise ValueError("must be a rigid transform: a rotation, a translation, and 0 0 0 1 below")
     return rows
@@ -295,5 +299,5 @@ def _witnesses(model: StatisticalModel) -> Int[np.ndarray, " w"]:
     return np.linspace(0, len(model.mean) - 1, WITNESSES).astype(np.int64)
 
 
-def _rows(values: Rows) -> tuple[tuple[float, ...], ...]:
+def _rows(values: Rows) -> Rounded:
     return tuple(map(tuple, values.tolist()))

@@ -10,6 +10,7 @@ import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from types import CodeType, FrameType
 from typing import Any
 
@@ -126,7 +127,7 @@ class Recorder(NamedGenerator):
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
         """Normal numbers of mean ``loc`` and standard deviation ``scale``; recorded."""
         shape = _shape(size, loc, scale)
-        return _plain(loc + scale * ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape))
+        return _plain(loc + scale * ndtri(self._take("normal", shape, -inf, inf)).reshape(shape))
 
     def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """Standard normal numbers; recorded, unless they are drawn into ``out``."""

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence, Sized
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import pi
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -43,6 +44,10 @@ WITNESSES = 40
 """Vertices of each segment whose motion tells whether two states are the same."""
 
 
+Given = Mapping[Key, Shares]
+"""Shares of draws that are known."""
+
+
 class Refused(ValueError):
     """Error of a state that a scene does not allow, for example because its parts would touch."""
 
@@ -62,7 +67,7 @@ class Played:
     seed: int
     calls: tuple[Call, ...]
     deformations: Deformations
-    remembered: Mapping[Key, Shares]
+    remembered: Given
     turns: Mapping[Key, tuple[float, Shares]]
 
     @property
@@ -113,7 +118,7 @@ def _played_by(scene: Scene, seed: int, recorder: Recorder) -> Played | None:
     return Played(seed, calls, deformations, {call.key: call.shares for call in calls}, {})
 
 
-def replayed(scene: Scene, seed: int, given: Mapping[Key, Shares]) -> Played | None:
+def replayed(scene: Scene, seed: int, given: Given) -> Played | None:
     """State by the shares of its draws, in their order; None where the scene refuses them, or draws others."""
     played = _played_by(scene, seed, Recorder(seed, given, len(given)))
     return played if played is not None and list(played.keys) == list(given) else None
@@ -122,7 +127,7 @@ def replayed(scene: Scene, seed: int, given: Mapping[Key, Shares]) -> Played | N
 def _played(
     scene: Scene,
     seed: int,
-    given: Mapping[Key, Shares],
+    given: Given,
     turns: Mapping[Key, tuple[float, Shares]],
     before: Played | None,
 ) -> Played:
@@ -232,7 +237,7 @@ def _parameter(call: Call, index: int, group: str, name: str) -> Parameter:
         if call.ends is not None:
             value = np.minimum(np.searchsorted(call.ends, share, side="right"), high - 1)
         return Parameter(call.key, index, group, name, "", low, high - 1, float(value), whole=True)
-    factor, unit = (180 / np.pi, "°") if call.name.unit == "rad" else (1.0, call.name.unit)
+    factor, unit = (180 / pi, "°") if call.name.unit == "rad" else (1.0, call.name.unit)
     low, high = low * factor, high * factor
     return Parameter(call.key, index, group, name, unit, low, high, low + share * (high - low))
 
@@ -271,7 +276,7 @@ def turned(shares: Shares, turn: float, seed: int | Pair) -> Shares:
     on it (elliptical slice sampling, Murray et al., AISTATS 2010, walks on the same curve). 0 and 1 are the start.
     """
     other = default_rng(seed).normal(size=len(shares))
-    angle = 2 * np.pi * turn
+    angle = 2 * pi * turn
     return ndtr(np.cos(angle) * ndtri(shares) + np.sin(angle) * other)
 
 
@@ -407,7 +412,7 @@ def _values(given: Any, names: list[str]) -> dict[str, Range]:
 
 def _shares(joint: JointSampler, value: float, within: float, unit_m: float) -> Range:
     """Least and greatest share of a joint's range by its value in radians or metres."""
-    unit, turn, name = (1.0, 2 * np.pi, "rad") if joint.turns else (unit_m, np.inf, "m")
+    unit, turn, name = (1.0, 2 * pi, "rad") if joint.turns else (unit_m, np.inf, "m")
     first, second = (unit * limit for limit in joint.limits)
     if joint.turns:  # a whole turn more is the same state
         value -= turn * round((value - (first + second) / 2) / turn)

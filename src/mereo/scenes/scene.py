@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from math import pi, radians
 from pathlib import Path
 
 import numpy as np
@@ -55,7 +56,7 @@ SCENES = (
 )
 """Built-in scenes, one module each in ``mereo_objects``: the paper's ten, then ours."""
 
-PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD = float(np.deg2rad(140.0)), float(np.deg2rad(360.0))
+PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD = radians(140.0), radians(360.0)
 
 
 class AssetUnavailable(OSError):
@@ -79,7 +80,7 @@ class Workspace:
     distance: Range = (100.0, 200.0)
     axis: Triple = (0.0, 0.0, 1.0)
     any_roll: bool = False
-    fov_rad: float = float(np.deg2rad(35.0))
+    fov_rad: float = radians(35.0)
 
     @property
     def all_around(self) -> bool:
@@ -88,10 +89,10 @@ class Workspace:
 
     def sample(self, rng: Generator, target: Vector) -> Transform:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
-        cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
-        azimuth = rng.uniform(0.0, 2 * np.pi)
+        cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, pi)), 1.0)
+        azimuth = rng.uniform(0.0, 2 * pi)
         distance = rng.uniform(*self.distance)
-        roll = rng.uniform(0.0, 2 * np.pi) if self.any_roll else 0.0
+        roll = rng.uniform(0.0, 2 * pi) if self.any_roll else 0.0
         return self.pose(target, cosine, azimuth, distance, roll)
 
     def pose(

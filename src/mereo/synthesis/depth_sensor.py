@@ -8,6 +8,7 @@ ray and surface normal.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import pi, radians
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -27,10 +28,10 @@ from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 Numbers = Float[ndarray, "*n"]
 """Numbers in any shape, which the whole signature has."""
 
-STEEPEST_RAD = float(np.deg2rad(80.0))
+STEEPEST_RAD = radians(80.0)
 """Largest angle of the noise formulas, which have a pole at 90 degrees: steeper surfaces count as seen at this one."""
 
-GRAZING_RAD = float(np.deg2rad(60.0))
+GRAZING_RAD = radians(60.0)
 """Angle from which on axial noise rises steeply and pixels go missing."""
 
 KINECT_FOCAL_PX, KINECT_DISPARITY_M = 585.0, 351.3
@@ -143,7 +144,7 @@ def lateral_std(z_m: Numbers, angle_rad: Numbers, model: SensorModel = "structur
     if model == "time-of-flight":
         return 0.0016 / z_m
     angle = np.minimum(angle_rad, STEEPEST_RAD)
-    return (0.8 + 0.035 * angle / (np.pi / 2 - angle)) / KINECT_FOCAL_PX
+    return (0.8 + 0.035 * angle / (pi / 2 - angle)) / KINECT_FOCAL_PX
 
 
 # --- depth ------------------------------------------------------------------------------------------------------------
@@ -157,7 +158,7 @@ def axial_std_m(z_m: Numbers, angle_rad: Numbers, model: SensorModel = "structur
     0.1 z^3/2 a^2 / (pi/2 - a)^2 millimetres.
     """
     angle = np.minimum(angle_rad, STEEPEST_RAD)
-    slant = (angle / (np.pi / 2 - angle)) ** 2
+    slant = (angle / (pi / 2 - angle)) ** 2
     if model == "time-of-flight":
         return 0.001 * (1.5 - 0.5 * z_m + 0.3 * z_m**2 + 0.1 * z_m**1.5 * slant)
     return 0.0012 + 0.0019 * (z_m - 0.4) ** 2 + 0.0001 * slant / np.sqrt(z_m)
@@ -234,7 +235,7 @@ def sample_holes(
     v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     for chosen in rng.integers(len(rows), size=rng.poisson(sensor.holes)):
         row, column = rows[chosen], columns[chosen]
-        radii_m, angle = rng.gamma(5.0, sensor.hole_radius_m / 5.0, size=2), rng.uniform(0, np.pi)
+        radii_m, angle = rng.gamma(5.0, sensor.hole_radius_m / 5.0, size=2), rng.uniform(0, pi)
         a, b = radii_m * focal_px / (depth[row, column] * sensor.metres_per_unit)
         along = (u - column) * np.cos(angle) + (v - row) * np.sin(angle)
         across = (v - row) * np.cos(angle) - (u - column) * np.sin(angle)

@@ -9,6 +9,7 @@ result does not depend on the size of a batch: it is, bit for bit, that of drawi
 """
 
 from collections.abc import Callable
+from math import inf
 from typing import NamedTuple, NoReturn, Protocol, runtime_checkable
 
 import numpy as np
@@ -66,7 +67,7 @@ def owner_labels(shape: Shape, points: Places) -> Labels:
     holds = np.stack([shape.inside(index, points) for index in range(shape.count)])
     labels = np.where(holds.any(axis=0), holds.argmax(axis=0) + 1, 0).astype(np.uint8)
     shared = np.flatnonzero(holds.sum(axis=0) > 1)
-    distance = np.full((shape.count, len(shared)), np.inf)
+    distance = np.full((shape.count, len(shared)), inf)
     for index in np.flatnonzero(holds[:, shared].any(axis=1)):
         mine = holds[index, shared]
         distance[index, mine] = shape.segment_distance(int(index), points[shared[mine]])
@@ -255,7 +256,7 @@ def _nearest_rows(shape: Shape, index: int, points: Places, keep: int) -> ndarra
     low, high = shape.boxes()[index]
     to_box = norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
     known = np.argsort(to_box, kind="stable")[: 2 * keep]
-    distance = np.full(len(points), np.inf)
+    distance = np.full(len(points), inf)
     distance[known] = shape.segment_distance(index, points[known])
     rest = np.flatnonzero(np.isinf(distance) & (to_box <= _keep_th(distance, keep)))
     if len(rest):

@@ -18,6 +18,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from math import pi
 from pathlib import Path
 from typing import NamedTuple
 
@@ -250,10 +251,10 @@ def _camera_aims(workspace: Workspace, times: Values, rng: Generator) -> list[Ca
     first = rng.normal(size=3)
     z = weights @ rng.normal(size=(weights.shape[1], 3))
     mixed = ndtr(np.sqrt(1 - CAMERA_REACH**2) * first[:2] + CAMERA_REACH * z[:, :2])
-    lowest = np.cos(min(workspace.aperture_rad / 2, np.pi))
+    lowest = np.cos(min(workspace.aperture_rad / 2, pi))
     cosine, (near, far) = lowest + mixed[:, 0] * (1 - lowest), workspace.distance
-    azimuth = 2 * np.pi * ndtr(first[2]) + CAMERA_TURN_RAD * z[:, 2]
-    roll = rng.uniform(0.0, 2 * np.pi) if workspace.any_roll else 0.0
+    azimuth = 2 * pi * ndtr(first[2]) + CAMERA_TURN_RAD * z[:, 2]
+    roll = rng.uniform(0.0, 2 * pi) if workspace.any_roll else 0.0
     distance = near + mixed[:, 1] * (far - near)
     return [
         partial(workspace.pose, cosine=float(c), azimuth_rad=float(a), distance=float(d), roll_rad=roll)

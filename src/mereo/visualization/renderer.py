@@ -6,6 +6,7 @@ camera's.
 
 from dataclasses import dataclass
 from itertools import permutations
+from math import inf
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
@@ -147,7 +148,7 @@ class Canvas:
     def empty(cls, view: Viewpoint, size: Size) -> "Canvas":
         """Blank picture; ``size`` is (width, height) when it is finished."""
         shape = (size[1] * SUPERSAMPLE, size[0] * SUPERSAMPLE)
-        return cls(view, np.full((*shape, 3), BACKGROUND), np.full(shape, np.inf))
+        return cls(view, np.full((*shape, 3), BACKGROUND), np.full(shape, inf))
 
     def draw_triangles(self, shown: Triangles) -> None:
         """Draw triangles where they are nearer than everything drawn before."""
@@ -221,12 +222,12 @@ def _cast(
 ) -> tuple[Indices, Values, Points]:
     """For each ray the first face (-1: none), the distance in lengths of its direction, barycentric weights."""
     if len(faces) == 0:
-        return np.full(len(origins), -1), np.full(len(origins), np.inf), np.zeros((len(origins), 3))
+        return np.full(len(origins), -1), np.full(len(origins), inf), np.zeros((len(origins), 3))
     vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
     face, share, place = cast_rays(search_tree(vertices, faces), vertices, faces, origins, directions)
     place[face < 0] = 0.0  # else it is whatever was in memory
     weights = np.concatenate([1 - place.sum(axis=1, keepdims=True), place], axis=1)
-    return face, np.where(face >= 0, share, np.inf), weights
+    return face, np.where(face >= 0, share, inf), weights
 
 
 def enclosed(mesh: SegmentedMesh) -> set[Pair]:

@@ -7,6 +7,7 @@ the motion leaves closed. Its range is as far as nothing collides, up to a limit
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from math import radians
 
 import numpy as np
 from jaxtyping import Float
@@ -36,7 +37,7 @@ POINTS, LEAST_POINTS = 1500, 12
 PLANE_SHARE = 0.1
 """Share of a contact that has one normal before it counts as a plane; facets of a round face have less from 11 on."""
 
-SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
+SAME_NORMAL = float(np.cos(radians(3.0)))
 
 FLATTEST, LEAST_ARC, MISFIT = 0.02, 0.1, 0.05
 """Mean square cosine of a cylinder's normals with its axis at most, and of them across their main direction at least
@@ -181,7 +182,7 @@ MOST_PASSES = 8
 NARROWER, NARROWEST = 0.8, 0.2
 """Factor of the ranges that take part in a collision, and share of a joint's range below which it is given up."""
 
-PARALLEL = float(np.cos(np.deg2rad(3.0)))
+PARALLEL = float(np.cos(radians(3.0)))
 
 ROUND_TEST_RAD = 0.7
 """A part that such a turn brings onto itself does not show that it turns."""

@@ -11,6 +11,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import radians
 from pathlib import Path
 from textwrap import indent
 from typing import Any, NamedTuple
@@ -179,7 +180,7 @@ LEAST_BASE, LEAST_COVER = 0.08, 0.25
 """Share of the hull's area within the outline of a base, and of that outline that is surface of the object: three
 places of a rounded body are no base."""
 
-LEAST_TILT = float(np.tan(np.deg2rad(15.0)))
+LEAST_TILT = float(np.tan(radians(15.0)))
 """Slope on which the object still stands."""
 
 
@@ -248,12 +249,12 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> Flat
     if share < LEAST_BASE or cover < LEAST_COVER or inside < LEAST_TILT * height:
         return None
     nearest = np.round(normal)
-    return FlatBase(nearest if np.abs(normal).max() > np.cos(np.deg2rad(3.0)) else normal, float(share))
+    return FlatBase(nearest if np.abs(normal).max() > np.cos(radians(3.0)) else normal, float(share))
 
 
 # --- the camera -------------------------------------------------------------------------------------------------------
 
-NEAR, FARTHER, MOST_VIEW_RAD = 100.0, 1.25, float(np.deg2rad(40.0))
+NEAR, FARTHER, MOST_VIEW_RAD = 100.0, 1.25, radians(40.0)
 """Nearest distance of the camera in scene units, as in the paper, or as far as the object fills no wider view; and the
 farthest in nearest ones. Twice, as in the paper, leaves a quarter of the picture's pixels."""
 
@@ -527,7 +528,7 @@ def _draft(name: str, source: _Source, meshes: MeshesConfig, aperture: float) ->
     up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
     if base is not None:
         up_reason, (x, y, z) = "it stands on its flat base", [rounded(value, 3) for value in -base.normal]
-    workspace = Workspace(float(np.deg2rad(aperture)), axis=(x, y, z), any_roll=aperture == 360.0)
+    workspace = Workspace(radians(aperture), axis=(x, y, z), any_roll=aperture == 360.0)
     near, far, view = _default_view(rest, moves.draw(rest, placement), workspace)
     unit, reason = (meshes.units, "as you said") if meshes.units else (source.unit, source.reason)
     text = TEMPLATE.format(
