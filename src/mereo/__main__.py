@@ -23,7 +23,7 @@ from mereo import __version__
 from mereo.api.words import option_words
 from mereo.cli import answers, scenes, tools, training, weights
 from mereo.cli.demo import Demo
-from mereo.cli.options import read_options, with_options
+from mereo.cli.options import Outcome, read_options, with_options
 from mereo.geometry.conventions import Facts
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import use_threads
@@ -144,7 +144,7 @@ def _run(command: Any) -> int:
     as_json = getattr(command, "json", False)
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         work = WORK.get(type(command))
-        outcome = command.run() if work is None else import_module(work).run(command)
+        outcome: Outcome | None = command.run() if work is None else import_module(work).run(command)
     if outcome is None:
         return 0
     if as_json:

@@ -23,7 +23,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from math import nan
 from pathlib import Path
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -50,7 +49,7 @@ from mereo.locating.following import Tracker
 from mereo.locating.whole_frame import at_point
 from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
-from mereo.reconstruction.observation import find_object
+from mereo.reconstruction.observation import Observation, find_object
 from mereo.results.joints import measure_joints
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
@@ -126,25 +125,25 @@ def stream(
     wrong in the sequence itself is raised after the outcomes before it.
     """
     source = _paced(frames) if recorded_pace else iter(frames)
-    each = ((frame, perf_counter(), 0) for frame in source if frame is not None)
+    each = ((frame, time.perf_counter(), 0) for frame in source if frame is not None)
     arriving = each if every_frame else _latest(source)
     with closing(arriving):
         for frame, arrived_s, dropped in arriving:
-            start, result, error = perf_counter(), None, ""
+            start, result, error = time.perf_counter(), None, ""
             try:
                 result = answer(frame)
             except Exception as problem:  # a damaged frame makes the libraries that parse it raise anything
                 error = frame_error(problem, frame.name)
-            now = perf_counter()
+            now = time.perf_counter()
             yield Outcome(frame.name, frame.time_s, result, error, now - arrived_s, now - start, dropped)
 
 
 def _paced(frames: Iterable[StreamFrame | None]) -> Frames:
-    start, zero = perf_counter(), None
+    start, zero = time.perf_counter(), None
     for frame in frames:
         if frame is not None:
             zero = frame.time_s if zero is None else zero
-            time.sleep(max(0.0, frame.time_s - zero - (perf_counter() - start)))
+            time.sleep(max(0.0, frame.time_s - zero - (time.perf_counter() - start)))
         yield frame
 
 
@@ -164,7 +163,7 @@ def _latest(frames: Frames) -> Generator[Arrived, None, None]:
                     with suppress(queue.Empty):
                         waiting.get_nowait()
                         dropped += 1
-                    waiting.put((frame, perf_counter(), dropped))
+                    waiting.put((frame, time.perf_counter(), dropped))
         except Exception as problem:  # raised in the caller's thread, after the outcomes before it
             end = problem
         while not is_left.is_set():
@@ -198,7 +197,7 @@ class Summary:
     failed: int = 0
     dropped: int = 0
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=RECENT))
-    start_s: float = field(default_factory=perf_counter)
+    start_s: float = field(default_factory=time.perf_counter)
 
     def add(self, outcome: Outcome) -> None:
         """Count an outcome."""
@@ -210,7 +209,7 @@ class Summary:
             self.latencies_s.append(outcome.latency_s)
 
     def __str__(self) -> str:
-        rate_hz = self.answered / (perf_counter() - self.start_s)
+        rate_hz = self.answered / (time.perf_counter() - self.start_s)
         median, worst = np.quantile(self.latencies_s, [0.5, 0.99]) if self.latencies_s else (nan, nan)
         return (
             f"{self.answered} frames answered at {rate_hz:.1f} Hz, latency {1e3 * median:.0f} ms (median), "
@@ -326,16 +325,16 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
         raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
     if not path.is_dir() or is_recording(path):
         raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
-    folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), perf_counter()
+    folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), time.perf_counter()
 
     def arriving() -> Frames:
         while True:
-            begun = perf_counter()
+            begun = time.perf_counter()
             for file in folder.look(begun):
                 load = _loader(partial(read_frame, file, reading), isolation)
-                yield StreamFrame(file.name, perf_counter() - start, load)
+                yield StreamFrame(file.name, time.perf_counter() - start, load)
             yield None
-            time.sleep(max(LOOK_S, perf_counter() - begun))  # at most half of the time in a folder of many files
+            time.sleep(max(LOOK_S, time.perf_counter() - begun))  # at most half of the time in a folder of many files
 
     return arriving()
 
@@ -347,13 +346,13 @@ def _is_frame(file: Path, reading: InputConfig) -> bool:
 
 
 def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamFrame]:
-    start = perf_counter()
+    start = time.perf_counter()
     if isinstance(sys.stdin, io.TextIOWrapper):
         sys.stdin.reconfigure(errors="surrogateescape")  # names are bytes: one that is no UTF-8 is still a file's
     for line in sys.stdin:
         if name := line.strip():
             load = _loader(partial(read_frame, name, reading), isolation)
-            yield StreamFrame(name, perf_counter() - start, load)
+            yield StreamFrame(name, time.perf_counter() - start, load)
 
 
 def _of_message(message: RecordedFrame, source: str, reading: InputConfig, isolation: IsolationConfig) -> StreamFrame:
@@ -541,7 +540,7 @@ class Answering:
 
     def __call__(self, frame: StreamFrame) -> FrameAnswer:
         """Answer to a frame; raises ``ValueError`` for unusable ones and other sizes, and where nothing is found."""
-        seen = frame.load()
+        seen: Observation = frame.load()
         if (image := seen.frame.whole) is not None:  # intrinsics that state no size would be those of any
             size = image.camera.width, image.camera.height
             self._size = self._size or size

@@ -51,7 +51,7 @@ def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str
         tensors = load(content)
         # 8 bytes with the length of a JSON object, which follows
         header = json.loads(content[8 : 8 + int.from_bytes(content[:8], "little")])
-        facts = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
+        facts: JsonObject = json.loads(header.get("__metadata__", {}).get(HEADER, "{}"))
         expected = facts.pop(CHECKSUM, None)
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(reason(error)) from None

@@ -7,11 +7,11 @@ is a bar on a terminal, else the same as a plain line now and then. What others 
 
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from dataclasses import dataclass
-from time import monotonic
 
 from rich.console import Console
 from rich.progress import BarColumn, TextColumn
@@ -38,12 +38,12 @@ class Progress:
 
     def __post_init__(self) -> None:
         self._task = None if self.bar is None else self.bar.add_task("", total=self.total, stage=self.stage)
-        self._started = self._shown = monotonic()
+        self._started = self._shown = time.monotonic()
         self._paused_s = 0.0
 
     def advance(self, count: int = 1, note: str = "") -> None:
         """Count ``count`` more units as done; ``note`` is shown behind the time left."""
-        now = monotonic()
+        now = time.monotonic()
         self.done += count
         rate = self.done / max(now - self._started - self._paused_s, 1e-9)
         left_s = (self.total - self.done) / max(rate, 1e-9)
@@ -61,11 +61,11 @@ class Progress:
     @contextmanager
     def paused(self) -> Iterator[None]:
         """Block whose time is no unit's: what is done between them."""
-        begun = monotonic()
+        begun = time.monotonic()
         try:
             yield
         finally:
-            self._paused_s += monotonic() - begun
+            self._paused_s += time.monotonic() - begun
 
 
 @contextmanager
@@ -83,7 +83,7 @@ def progress(
         shown = Progress(stage, total, unit, each, quiet, bar)
         yield shown
     if shown.done and not quiet:
-        _print(f"{stage}: {shown.done} {unit} in {duration(monotonic() - shown._started)}")
+        _print(f"{stage}: {shown.done} {unit} in {duration(time.monotonic() - shown._started)}")
 
 
 def tracked(stage: str, count: int, unit: str, *, quiet: bool = False) -> Iterator[int]:
@@ -117,12 +117,12 @@ def stage(text: str) -> Iterator[None]:
     if not SHOWS_STAGES.get():
         yield
         return
-    started, ended = monotonic(), threading.Event()
+    started, ended = time.monotonic(), threading.Event()
 
     def show() -> None:
         wait_s = STAGE_S
         while not ended.wait(wait_s):
-            _print(f"{text}: {duration(monotonic() - started)} so far")
+            _print(f"{text}: {duration(time.monotonic() - started)} so far")
             wait_s = LINE_EVERY_S
 
     thread = threading.Thread(target=show, daemon=True, name="stage")

@@ -8,13 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
-from numpy import ndarray
 from numpy.linalg import norm
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import Triple
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import Corners, Points, box_of
+from mereo.geometry.transforms import Corners, Points, Vector, box_of
 from mereo.io.errors import AnyPath
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -29,7 +28,7 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.renderer import Vector, Viewpoint, shade, shaded_canvas
+from mereo.visualization.renderer import Viewpoint, shade, shaded_canvas
 
 CAMERA_VIEWS = {
     "as the camera sees it": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -65,7 +64,7 @@ def render_cloud_and_segments(
 
 
 def points_on_segments(
-    points: Points, surfaces: SegmentedMesh, sides: Sequence[tuple[Vector, Vector]], size: int
+    points: Points, surfaces: SegmentedMesh, sides: Sequence[tuple[Triple, Triple]], size: int
 ) -> list[Picture]:
     """Pictures of the segments with the observed points on them as dark dots, one from each side.
 
@@ -108,7 +107,7 @@ def preview_states(
     views: Sequence[View],
     title: str = "",
     size: int = 220,
-    up: Vector = (0.0, 0.0, 1.0),
+    up: Triple = (0.0, 0.0, 1.0),
 ) -> None:
     """Write a sheet of states, three in a row: what the camera sees, the state from a fixed side, the depth image.
 
@@ -132,7 +131,7 @@ def preview_states(
     save_png(path, contact_sheet(images, captions, 9, title))
 
 
-def _from_side(view: View, size: int, up: Vector) -> Picture:
+def _from_side(view: View, size: int, up: Triple) -> Picture:
     world = view.mesh.transformed(view.T_world_camera)
     center = world.bounds.mean(axis=0)
     radius = float(norm(world.bounds[1] - world.bounds[0])) / 2
@@ -147,7 +146,7 @@ def _from_side(view: View, size: int, up: Vector) -> Picture:
     return shade(shown, replace(side, half_size=1.4 * radius), (size, size))
 
 
-def _arrow(center: Float[ndarray, "3"], toward: Float[ndarray, "3"], radius: float) -> Segment:
+def _arrow(center: Vector, toward: Vector, radius: float) -> Segment:
     """A cone on a thin shaft outside the object, pointing at it along the camera's line of sight."""
     # (thickness, distance from the centre), both in radii, from the tip to the end of the shaft
     profile = ((0.0, 0.85), (0.08, 1.03), (0.03, 1.03), (0.03, 1.35), (0.0, 1.35))
