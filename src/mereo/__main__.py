@@ -24,6 +24,7 @@ from mereo.api.words import option_words
 from mereo.cli import answers, scenes, tools, training, weights
 from mereo.cli.demo import Demo
 from mereo.cli.options import Outcome, read_options, with_options
+from mereo.geometry.conventions import Facts
 from mereo.io.bounds import check_bounds
 from mereo.io.cores import use_threads
 from mereo.io.errors import is_foreseen, printable_line, words_of
@@ -332,7 +333,7 @@ def parse(arguments: list[str]) -> Any:
     return command
 
 
-def _syntax(members: Mapping[str, Any], starts: Mapping[str, Any]) -> Any:
+def _syntax(members: Facts, starts: Facts) -> Any:
     """Commands, or those of a group, as a type that tyro reads; some start from other defaults than their class's."""
     kinds = list[Any]()
     for name, member in members.items():

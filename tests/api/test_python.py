@@ -7,7 +7,6 @@ import re
 import sys
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -36,7 +35,7 @@ from mereo.fitting.registration.registration import Located
 from mereo.geometry.camera import SCANNER_TO_CAMERA, Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes, Way
 from mereo.geometry.transforms import transform_points
-from mereo.io.atomic_files import MARKER
+from mereo.io.atomic_files import MARKER, JsonObject
 from mereo.io.config import InputConfig, MeshesConfig
 from mereo.io.sensor_frame import SensorFrame
 from mereo.models.model import Model
@@ -53,7 +52,7 @@ from mereo.synthesis.sample_views import load_view
 from mereo.visualization.units import Unit
 from mereo_learning import shards
 from mereo_learning.cases import Evaluation
-from mereo_learning.config import PRESETS, TrainConfig
+from mereo_learning.config import PRESETS
 from mereo_learning.learn import LearnConfig
 from mereo_viewer import result_page
 from mereo_viewer.server import OpenPage
@@ -66,9 +65,9 @@ def result() -> Result:
     return mereo.reconstruct(seen(), MODEL, resolution=24, unit_m=1.0, label_points=True)
 
 
-def contents(folder: Path) -> dict[str, Any]:
+def contents(folder: Path) -> JsonObject:
     """Files of a folder by name; of figures what does not differ from run to run."""
-    found: dict[str, Any] = {}
+    found = {}
     for path in sorted(folder.rglob("*")):
         if path.name == "summary.json":
             facts = read_json(path)
@@ -359,14 +358,14 @@ def test_without_a_name_it_is_saved_beside_the_last(result: Result, working_fold
 
 
 def test_generate_and_train_are_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[tuple[Any, ...]] = []
+    calls = []
     monkeypatch.setattr(shards, "generate", lambda *given, **named: calls.append((*given, named)))
     assert mereo.generate(tmp_path / "mine.yaml", str(tmp_path / "data"), examples=3, workers=2) == tmp_path / "data"
     ((scene, output, config, named),) = calls
     assert (scene, output) == (str(tmp_path / "mine.yaml"), tmp_path / "data")
     assert config == shards.DatasetConfig(GenerateConfig(), 3, 0)
     assert named == {"workers": 2, "shard": (0, 1), "resume": False}
-    trained: list[TrainConfig] = []
+    trained = []
     monkeypatch.setattr(steps.trainer, "train", lambda data, run, recipe, device: trained.append(recipe) or run / "w")
     assert mereo.train("data", tmp_path, "tiny", init="rope") == tmp_path / "w"
     assert trained == [replace(PRESETS["tiny"], init="rope")]
@@ -386,7 +385,7 @@ def test_evaluate_scores_with_and_without_a_folder(tmp_path: Path) -> None:
 
 
 def test_learn_and_export_return_what_they_leave(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    calls: list[Any] = []
+    calls = []
     scores = {"iou": 0.9, "miou": 0.8, "trained": True, "method": "auto"}
     monkeypatch.setattr(steps.learning, "learn", lambda files, output, config: calls.append((files, config)) or scores)
     learned = mereo.learn("rope", tmp_path, minutes=3)

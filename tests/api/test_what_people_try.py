@@ -8,7 +8,7 @@ import json
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor, Future
 from dataclasses import replace
 from functools import partial
@@ -25,12 +25,14 @@ import trimesh
 from analytic import untrained
 from answers import answer_to
 from memory_frames import Tensor, TensorMap, Vectors
+from numpy import ndarray
 from numpy.testing import assert_allclose, assert_equal
 from PIL import Image
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 from toy_frames import MODEL, NAMES, seen
 from toy_scene import toy_scene
+from trimesh.creation import box
 
 import mereo
 from mereo import load_frame, load_object, reconstruct
@@ -67,7 +69,7 @@ def camera_info(**changes: Any) -> SimpleNamespace:
     return SimpleNamespace(**{**fields, **changes})
 
 
-def depth_message(values: np.ndarray, encoding: str) -> SimpleNamespace:
+def depth_message(values: ndarray, encoding: str) -> SimpleNamespace:
     """Message of ROS with a depth image."""
     return SimpleNamespace(
         encoding=encoding, step=values.strides[0], is_bigendian=0, data=values.tobytes(), height=HEIGHT, width=WIDTH
@@ -81,7 +83,7 @@ def load(intrinsics: Any, depth: Any = METRES) -> SensorFrame:
 OPEN3D = {"intrinsic": {"intrinsic_matrix": K.T.ravel().tolist(), **SIZE}}
 REALSENSE = {"fx": 80.0, "fy": 90.0, "ppx": 15.5, "ppy": 11.5, "coeffs": [0.0] * 5, "model": "brown", **SIZE}
 
-DEPTH: dict[str, tuple[Any, Any]] = {
+DEPTH = {
     "metres and a matrix": (METRES, K),
     "nested lists": (METRES.tolist(), K.tolist()),
     "millimetres": (MILLIMETRES, K),
@@ -146,15 +148,13 @@ def test_columns_behind_positions_are_normals_or_colours() -> None:
 
 # --- what goes in: meshes ---------------------------------------------------------------------------------------------
 
-LEFT, RIGHT = (
-    trimesh.creation.box((20, 30, 10), trimesh.transformations.translation_matrix((x, 0, 0))) for x in (0, 20)
-)
+LEFT, RIGHT = (box((20, 30, 10), trimesh.transformations.translation_matrix((x, 0, 0))) for x in (0, 20))
 BOXES = {"left": LEFT, "right": RIGHT}
 LEFT.metadata["name"], RIGHT.metadata["name"] = BOXES
-SMALL = trimesh.creation.box((0.1, 0.1, 0.1))
+SMALL = box((0.1, 0.1, 0.1))
 
 
-def arrays(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+def arrays(mesh: trimesh.Trimesh) -> tuple[ndarray, ndarray]:
     return np.asarray(mesh.vertices), np.asarray(mesh.faces)
 
 
@@ -185,7 +185,7 @@ def moved_scene() -> trimesh.Scene:
     return scene.apply_translation([5, 0, 0])
 
 
-MESHES: dict[str, Any] = {
+MESHES = {
     "a dict of trimesh": BOXES,
     "a scene of trimesh": moved_scene(),
     "a list with names": [LEFT, RIGHT],
@@ -234,8 +234,12 @@ FITTED = ("metres", "a scanner's millimetres", "an unknown unit")
 ANSWERED = (*FITTED, "a network")
 
 
+Results = dict[str, Any]
+"""A result of each kind."""
+
+
 @pytest.fixture(scope="module")
-def results(rope: Model) -> dict[str, Any]:
+def results(rope: Model) -> Results:
     """Registered in frames of all kinds; a network's with a segment that was not found; lost."""
     assert rope.statistical_model is not None
     sized, free = (replace(rope.statistical_model, source_frame=SourceFrame(FILES, unit)) for unit in (UNIT_M, None))
@@ -246,7 +250,7 @@ def results(rope: Model) -> dict[str, Any]:
         answer_to(scan, rope, known, 16, "scanner", 0.001),
         answer_to(cloud, rope, Registrar(rope, free, "modes"), 16),
     )
-    made: dict[str, Any] = dict(zip(FITTED, map(Result.of, answers), strict=True))
+    made = dict(zip(FITTED, map(Result.of, answers), strict=True))
     made["a network"] = answered(resolution=24, unit_m=1.0, label_points=True)
     waiting = type("Waiting", (Executor,), {"submit": lambda *_, **__: Future()})()
     alone, pose = mereo.Object(None, None, model=sized), made["metres"].pose
@@ -258,7 +262,7 @@ def results(rope: Model) -> dict[str, Any]:
 
 POINTS = [[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]]
 
-OUTPUT: dict[str, Callable[[Any], object]] = {
+OUTPUT = {
     "a name in it": lambda r: "base" in r and "head" not in r,
     "its length": lambda r: len(r) == 9 and [segment.name for segment in r] == list(r.names),
     "JSON": lambda r: json.loads(json.dumps(r.to_dict(), allow_nan=False)) == r.to_dict(),
@@ -280,12 +284,12 @@ OUTPUT: dict[str, Callable[[Any], object]] = {
 
 @pytest.mark.parametrize("kind", FITTED)
 @pytest.mark.parametrize("line", OUTPUT)
-def test_what_is_asked_of_a_result_comes_out(line: str, kind: str, results: dict[str, Any]) -> None:
+def test_what_is_asked_of_a_result_comes_out(line: str, kind: str, results: Results) -> None:
     assert OUTPUT[line](results[kind])
 
 
 @pytest.mark.parametrize("kind", FITTED)
-def test_the_covariance_is_that_of_the_pose_under_the_posterior(kind: str, results: dict[str, Any]) -> None:
+def test_the_covariance_is_that_of_the_pose_under_the_posterior(kind: str, results: Results) -> None:
     """By differences of the pose along each of the posterior's independent numbers, and towards other states."""
     fit = results[kind].registered
     sure, posterior, unit = fit.uncertainty, fit.uncertainty.posterior, fit.uncertainty.optimum.unit
@@ -319,7 +323,7 @@ def same(stored: Any, result: Any) -> None:
     assert not result or np.array_equal(stored.labels.labels, result.labels.labels)
 
 
-def test_a_result_goes_to_another_process_and_back(results: dict[str, Any]) -> None:
+def test_a_result_goes_to_another_process_and_back(results: Results) -> None:
     code = (
         "import copy, pickle, sys; r = pickle.load(sys.stdin.buffer); assert [*map(len, r.values())] == [9, 9, 9, 3, 0]"
     )
@@ -333,7 +337,7 @@ def test_a_result_goes_to_another_process_and_back(results: dict[str, Any]) -> N
 
 @pytest.mark.usefixtures("small_previews")
 @pytest.mark.parametrize("kind", ANSWERED)
-def test_a_folder_is_loaded_as_it_was_saved(kind: str, results: dict[str, Any], tmp_path: Path) -> None:
+def test_a_folder_is_loaded_as_it_was_saved(kind: str, results: Results, tmp_path: Path) -> None:
     for number, result in enumerate((results[kind], results[kind].transformed(T_BASE))):
         folder = result.save(tmp_path / str(number))
         same(mereo.load_result(folder), result)
@@ -348,7 +352,7 @@ def test_a_folder_is_loaded_as_it_was_saved(kind: str, results: dict[str, Any], 
         mereo.load_result(folder)
 
 
-def test_a_lost_object_says_so_in_every_form(results: dict[str, Any]) -> None:
+def test_a_lost_object_says_so_in_every_form(results: Results) -> None:
     lost = results["lost"]
     facts = lost.to_dict()
     assert (facts["tracking"], facts["verdict"], facts["segments"]) == ("lost", "no", [])
@@ -362,7 +366,7 @@ def test_a_lost_object_says_so_in_every_form(results: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("kind", ANSWERED)
-def test_a_result_in_a_robots_frame_is_the_same_there(kind: str, results: dict[str, Any]) -> None:
+def test_a_result_in_a_robots_frame_is_the_same_there(kind: str, results: Results) -> None:
     result, moved = results[kind], results[kind].transformed(T_BASE)
     near = partial(assert_allclose, atol=1e-9 * np.ptp(result.surfaces.merged()[0]), rtol=1e-9)
     place, facts, labels = partial(transform_points, T_BASE), moved.to_dict(), moved.labels
@@ -396,7 +400,7 @@ def masked(mask: object, **options: object) -> SensorFrame:
     return load_frame(ONES, mask=mask, **options)
 
 
-def queried(points: np.ndarray) -> object:
+def queried(points: ndarray) -> object:
     """Answer of a network at these points."""
     model = untrained(NAMES)
     return model.query(model.encode(seen()), points)
@@ -409,7 +413,7 @@ def answered(**options: Any) -> Result:
 GRID = "resolution is .*; it must be a whole number, from 4 to 4096: give for example 128"
 
 
-REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+REFUSED = {
     "a camera of a cloud": (lambda: load(K, "bun000.ply"), "bun000.ply is read as a point cloud; leave out intrinsics"),
     "distortion": (
         lambda: load(camera_info(d=np.array([0.1, 0.0, 0.0, 0.0, 0.0]))),

@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from folder_contents import run_mereo
 
 import mereo.__main__ as command_line
 from mereo.cli import tools as doctor
@@ -24,6 +25,7 @@ from mereo.cli import training
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import Outcome
 from mereo.cli.reconstruct import FrameJob
+from mereo.geometry.conventions import Names, Texts
 from mereo.io.config import InputConfig
 from mereo.models import device
 from mereo.models.config import InferenceConfig
@@ -53,7 +55,7 @@ def test_help_loads_no_heavy_library_and_few_modules(command: str) -> None:
 
 @pytest.mark.parametrize("option", ["-V", "--version"])
 def test_version(option: str, capsys: pytest.CaptureFixture) -> None:
-    assert command_line.main([option]) == 0
+    assert run_mereo(option) == 0
     assert capsys.readouterr().out == f"mereo {version('mereo')}\n"
 
 
@@ -105,7 +107,7 @@ def test_without_standard_streams_a_command_does_its_work(streams: str, line: st
     ],
 )
 def test_arguments_that_mean_no_command_are_explained_in_a_box(
-    arguments: str, parts: tuple[str, ...], capsys: pytest.CaptureFixture
+    arguments: str, parts: Names, capsys: pytest.CaptureFixture
 ) -> None:
     with pytest.raises(SystemExit, match="^2$"):
         command_line.main(arguments.split())
@@ -201,7 +203,7 @@ def help_of(command: str) -> str:
     with pytest.MonkeyPatch.context() as patch, redirect_stdout(text):
         patch.setenv("COLUMNS", "120")  # wider ones show two boxes side by side
         with pytest.raises(SystemExit):
-            command_line.main([*command.split(), "--help"])
+            run_mereo(*command.split(), "--help")
     text.seek(0)
     return text.read()
 
@@ -214,9 +216,9 @@ def commands(group: str = "") -> Iterator[str]:
         yield group
 
 
-def entries(command: str) -> dict[str, str]:
+def entries(command: str) -> Texts:
     """What a command takes, as its help shows it, each with its explanation but for defaults and rules."""
-    found: dict[str, str] = {}
+    found = {}
     for line in help_of(command).splitlines():
         if re.match(r"│ (-|[A-Z{\[])", line):  # lower case begins what is said of a whole box
             name, _, text = line.strip("│ ").partition("  ")
@@ -246,7 +248,7 @@ def test_every_option_is_explained(command: str) -> None:
 def test_completion_prints_as_documented(shell: str, capsys: pytest.CaptureFixture) -> None:
     assert f"mereo --tyro-print-completion {shell}" in QUICKSTART.read_text("utf-8")
     with pytest.raises(SystemExit) as end:
-        command_line.main(["--tyro-print-completion", shell])
+        run_mereo("--tyro-print-completion", shell)
     script = capsys.readouterr().out
     assert not end.value.code and "mereo" in script
     for word in ("reconstruct", "weights", "--resolution", "--learning-rate"):

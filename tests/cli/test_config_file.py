@@ -9,12 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from folder_contents import run_mereo
 from golden_objects import weights_of
 from two_balls import scene
 
 from mereo import __main__ as command_line
 from mereo.cli.options import options_of
 from mereo.io import progress
+from mereo.io.atomic_files import JsonObject
 from mereo.synthesis.config import SENSORS
 from mereo.synthesis.sample_views import load_view
 from mereo_learning.config import PRESETS
@@ -33,7 +35,7 @@ LINES = {
 }
 
 
-def parsed(text: str) -> dict[str, Any]:
+def parsed(text: str) -> JsonObject:
     return vars(command_line.parse(text.split()))
 
 
@@ -105,13 +107,13 @@ def test_what_is_wrong_with_a_file_is_one_sentence(
     content: Any, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     path, out = str(written(tmp_path, content)), tmp_path / "out"
-    assert command_line.main(["reconstruct", "a", "--weights", "w", "--output", str(out), "--config", path]) == 2
+    assert run_mereo("reconstruct", "a", "--weights", "w", "--output", out, "--config", path) == 2
     said = capsys.readouterr().err
     assert sentence in said and said.count("\n") == 1 and not out.exists(), said
 
 
 def test_a_file_that_is_not_there(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert command_line.main(["learn", "a.stl", "--output", "out", "--config", str(tmp_path / "no.json")]) == 2
+    assert run_mereo("learn", "a.stl", "--output", "out", "--config", tmp_path / "no.json") == 2
     assert "no.json does not exist; --config takes a file of options" in capsys.readouterr().err
 
 
@@ -125,7 +127,7 @@ def test_a_result_is_made_again_from_its_own_options(
     assert command_line.main(line.split()) == 4, "the network alone"
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
-    assert command_line.main(["reconstruct", "--config", "../first/config.json", "--output", "second"]) == 4
+    assert run_mereo("reconstruct", "--config", "../first/config.json", "--output", "second") == 4
     first, second = tmp_path / "first", tmp_path / "elsewhere/second"
     assert {path.name for path in first.iterdir()} == {path.name for path in second.iterdir()}
     assert (first / "config.json").read_text() == (second / "config.json").read_text()
@@ -147,7 +149,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_previews: None) 
 
 
 def mereo(*arguments: str) -> int:
-    return command_line.main([*arguments, "--resolution", "12", "--formats", "glb"])
+    return run_mereo(*arguments, "--resolution", "12", "--formats", "glb")
 
 
 def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: pytest.CaptureFixture) -> None:

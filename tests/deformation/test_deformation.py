@@ -1,11 +1,12 @@
 """Every deformation: positive Jacobian, inverse, closed form, and the bounds beyond which it is refused."""
 
-from collections.abc import Callable
+from math import pi
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy import ndarray
 from numpy.linalg import det, norm
 from numpy.random import Generator, default_rng
 from scipy.interpolate import BSpline
@@ -40,7 +41,7 @@ REACH = HALF * 3**0.5
 BOX = np.array([[-HALF] * 3, [HALF] * 3])
 
 
-def direction(rng: Generator) -> np.ndarray:
+def direction(rng: Generator) -> ndarray:
     vector = rng.normal(size=3)
     return vector / norm(vector)
 
@@ -65,7 +66,7 @@ def make_sweep(rng: Generator) -> Deformation:
     )
 
 
-MAKERS: dict[str, Callable[[Generator], Deformation]] = {
+MAKERS = {
     "identity": lambda rng: Identity(),
     "rigid": lambda rng: Rigid(rng.uniform(-2, 2, 3), rng.uniform(-5, 5, 3), rng.uniform(-5, 5, 3)),
     "bend": make_bend,
@@ -80,7 +81,7 @@ MAKERS: dict[str, Callable[[Generator], Deformation]] = {
 }
 
 
-def cube(rng: Generator, count: int = 300) -> np.ndarray:
+def cube(rng: Generator, count: int = 300) -> ndarray:
     return rng.uniform(*BOX, size=(count, 3))
 
 
@@ -232,11 +233,11 @@ def test_window_is_its_inner_map_inside_and_nothing_outside() -> None:
 
 
 def test_sweep_onto_a_circle_is_a_torus() -> None:
-    angle = np.linspace(0, 1.5 * np.pi, 400)
+    angle = np.linspace(0, 1.5 * pi, 400)
     centers = 10.0 * np.stack([np.sin(angle), 1 - np.cos(angle), np.zeros_like(angle)], axis=1)
     sweep = CurveSweep.through(10.0 * angle, centers, np.array([0.0, 1, 0]), radius=4.0)
     rng = default_rng(10)
-    x, y, z = rng.uniform([0, -4, -4], [15 * np.pi, 4, 4], size=(500, 3)).T
+    x, y, z = rng.uniform([0, -4, -4], [15 * pi, 4, 4], size=(500, 3)).T
     t, ring = x / 10.0, 10.0 - y
     expected = np.stack([ring * np.sin(t), 10 - ring * np.cos(t), z], axis=1)
     points = np.stack([x, y, z], axis=1)
@@ -244,11 +245,11 @@ def test_sweep_onto_a_circle_is_a_torus() -> None:
     assert np.allclose(jacobian_determinant(sweep, points), 1 - y / 10, atol=1e-3)
     # straight before the start (the identity here) and beyond the end (three quarters round: heading along -y)
     assert np.allclose(sweep(np.array([[-5.0, 2, 1]])), [[-5.0, 2, 1]], atol=1e-4)
-    assert np.allclose(sweep(np.array([[15 * np.pi + 5.0, 0, 1]])), [[-10.0, 5.0, 1]], atol=1e-4)
+    assert np.allclose(sweep(np.array([[15 * pi + 5.0, 0, 1]])), [[-10.0, 5.0, 1]], atol=1e-4)
 
 
 def test_transported_frames_are_rotations_that_do_not_twist() -> None:
-    t = np.linspace(0, 4 * np.pi, 2000)
+    t = np.linspace(0, 4 * pi, 2000)
     tangents = np.stack([-np.sin(t), np.cos(t), np.full_like(t, 0.5)], axis=1) / np.hypot(1, 0.5)
     frames = transport_frames(tangents, np.array([1.0, 1.0, 0.3]))
     assert np.allclose(frames @ frames.transpose(0, 2, 1), np.eye(3)) and np.allclose(det(frames), 1)
@@ -257,12 +258,12 @@ def test_transported_frames_are_rotations_that_do_not_twist() -> None:
     assert np.abs(twist[2:-2]).max() < 1e-4
     # after a turn of the helix the frame has turned by the solid angle its tangents enclose: 2 pi (1 - sin(pitch))
     turn = Rotation.from_matrix(frames[999].T @ frames[0]).magnitude()
-    enclosed = 2 * np.pi * (1 - 0.5 / np.hypot(1, 0.5))
-    assert np.isclose(turn, min(enclosed, 2 * np.pi - enclosed), atol=0.02)
+    enclosed = 2 * pi * (1 - 0.5 / np.hypot(1, 0.5))
+    assert np.isclose(turn, min(enclosed, 2 * pi - enclosed), atol=0.02)
 
 
 ORIGIN, Z = np.zeros(3), np.array([0.0, 0.0, 1.0])
-REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+REFUSED = {
     "bend": (
         lambda: Bend(ORIGIN, *np.eye(3)[[2, 0]], 4.0, 2.0, 3.0),
         "curvature 0.5 times radius 3 is 1.5; it must be below 1 .*: bend less sharply or make the object thinner",

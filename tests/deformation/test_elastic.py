@@ -3,10 +3,12 @@
 import pickle
 from dataclasses import replace
 from functools import cache
+from math import nan
 
 import numpy as np
 import pytest
 from lattice import fine, lattice
+from numpy import ndarray
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from shapes import box
@@ -48,11 +50,11 @@ def partly_filled() -> ElasticSolid:
 
 
 @cache
-def modes(scale: float = 1.0, young: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+def modes(scale: float = 1.0, young: float = 1.0) -> tuple[ndarray, ndarray]:
     return find_modes(solid(scale), COUNT, Material(young=young))
 
 
-def covariance(scale: float = 1.0, young: float = 1.0, power: float = 2.0) -> np.ndarray:
+def covariance(scale: float = 1.0, young: float = 1.0, power: float = 2.0) -> ndarray:
     """Of all nodes' coordinates, which no sign or order of modes changes."""
     flat = scale_modes(*modes(scale, young), motion=0.2 * scale, power=power).reshape(-1, COUNT)
     return flat @ flat.T
@@ -168,7 +170,7 @@ def test_no_drawn_state_folds_or_swells_however_large_the_motion() -> None:
     assert calmed > 6
 
 
-def no_surface() -> tuple[np.ndarray, np.ndarray]:
+def no_surface() -> tuple[ndarray, ndarray]:
     return np.empty((0, 3)), np.empty((0, 3))
 
 
@@ -176,7 +178,7 @@ def test_a_stiffer_part_bends_less() -> None:
     bar = SegmentedMesh((box((0, 0, 0), (3, 1, 1), "left", 0), box((3, 0, 0), (6, 1, 1), "right", 1)))
     even, uneven = (build_lattice(bar, 12, stiffness) for stiffness in ((1.0, 1.0), (1.0, 50.0)))
 
-    def energies(body: ElasticSolid) -> np.ndarray:
+    def energies(body: ElasticSolid) -> ndarray:
         """Strain energy of each half in the softest modes, under the same stiffness."""
         _, vectors = find_modes(body, 4, Material())
         center, flat = body.mesh.nodes[body.mesh.elements].mean(axis=1)[:, 0], vectors.reshape(-1, 4)
@@ -208,7 +210,7 @@ def test_what_is_held_does_not_move_and_nothing_is_rigid() -> None:
 
 
 def test_bad_materials_lattices_and_modes_are_refused() -> None:
-    for value in (0.5, -1.0, np.nan):
+    for value in (0.5, -1.0, nan):
         with pytest.raises(ValueError, match="must lie between -1 and 0.5: take 0.4 for tissue"):
             Material(value)
     with pytest.raises(ValueError, match="a lattice of 1 cells cannot bend; 2 or more are needed: take 16"):
@@ -216,7 +218,7 @@ def test_bad_materials_lattices_and_modes_are_refused() -> None:
     (part,) = block().segments
     with pytest.raises(ValueError, match="has no inside: turn its faces outward"):
         build_lattice(SegmentedMesh((replace(part, faces=part.faces[:, ::-1].copy()),)), 8)
-    for share in (0.0, 1.5, np.nan):
+    for share in (0.0, 1.5, nan):
         with pytest.raises(ValueError, match="must be above 0 and at most 1: leave empty ones out"):
             ElasticSolid(lattice(), np.full(len(lattice().elements), share))
     small = build_lattice(block(), 2)
@@ -224,7 +226,7 @@ def test_bad_materials_lattices_and_modes_are_refused() -> None:
     for count in (0, most + 1):
         with pytest.raises(ValueError, match=f"{count} modes of .* nodes; from 1 to {most} exist: take more cells"):
             find_modes(small, count, Material())
-    for value in (0.0, np.inf, np.nan):
+    for value in (0.0, np.inf, nan):
         with pytest.raises(ValueError, match="must be above 0: take 1, which changes no mode"):
             Material(young=value)
         with pytest.raises(ValueError, match="it must be above 0: a tenth of half the longest side is moderate"):

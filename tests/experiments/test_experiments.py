@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from folder_contents import read_json
+from folder_contents import read_json, run_mereo
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 
-from mereo import __main__ as command_line
 from mereo.geometry.camera import PointCloud
 from mereo.models.weights import load_model
 from mereo.synthesis.config import GenerateConfig
@@ -118,7 +117,7 @@ def test_the_list_says_which_results_are_here(tmp_path: Path, capsys: pytest.Cap
         write_result(result, tmp_path / "results" / folder)
     (tmp_path / "runs" / "rope-1").mkdir(parents=True)
     (tmp_path / "runs" / "rope-1" / "finished.json").write_text("{}")
-    assert command_line.main(["experiment", "list", "--output", str(tmp_path)]) == 0
+    assert run_mereo("experiment", "list", "--output", tmp_path) == 0
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("results here: none") == len(EXPERIMENTS) - 1 and "results here: cpu, smoke-rope" in said
     assert "1 finished training there" in said
@@ -197,7 +196,7 @@ def test_the_rival_answers_as_the_model() -> None:
 
 def test_needed_nodes_are_the_corners_of_cells_with_a_change() -> None:
     labels = (default_rng(1).random((6, 5, 4)) < 0.1).astype(np.uint8)
-    needed = np.zeros(labels.shape, dtype=bool)
+    needed = np.zeros(labels.shape, bool)
     for cell in np.ndindex(5, 4, 3):
         corners = tuple(np.array([np.add(cell, step) for step in product((0, 1), repeat=3)]).T)
         if len(np.unique(labels[corners])) > 1:
@@ -235,7 +234,7 @@ def test_the_table_names_ratio_and_floor() -> None:
 
 def test_a_stage_says_how_many_labels_the_straightforward_way_gives_otherwise() -> None:
     bench = Bench(load_model("rope"), load_view("rope"), MACHINE, repeats=2, rival=True)
-    ours = np.zeros((2, 2, 5), dtype=np.uint8)
+    ours = np.zeros((2, 2, 5), np.uint8)
     theirs = ours.copy()
     theirs[0, 0, 0] = 1
     stage = bench._stage("labels", Work(1.0, 1.0), lambda: ours, lambda: theirs, once=True)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import trimesh
 from label_cases import CENTER, ORIGIN, RADIUS, SPACING, halves, nibabel, write_nifti
+from numpy import ndarray
 from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from overlapping import check_overlap
 from shapes import ball, box
@@ -74,7 +76,7 @@ def test_surfaces_are_smooth_and_neighbours_touch(tmp_path: Path) -> None:
 
 
 def test_a_segment_at_the_border_is_closed(tmp_path: Path) -> None:
-    labels = np.ones((20, 30, 10), dtype=np.int64)
+    labels = np.ones((20, 30, 10), np.int64)
     mesh = segment_surfaces(read_label_volume(write_nifti(tmp_path / "a.nii", labels)), {1: "block"}, 96)
     mesh.check()
     assert_allclose(mesh.bounds[0], ORIGIN - SPACING / 2, atol=0.6)
@@ -106,13 +108,13 @@ def test_a_scene_from_a_label_volume(tmp_path: Path) -> None:
     scene = load_scene(path)
     assert scene.rest.names == ("liver", "spleen")
     assert scene.unit_m == pytest.approx(0.08 / 20, rel=0.05)
-    check_overlap(scene.sample_state(np.random.default_rng(0)).mesh)
+    check_overlap(scene.sample_state(default_rng(0)).mesh)
     path.write_text("name: organs\nunits: mm\nlabels: ct.nii.gz\nnames: {1: liver, 5: spleen}\n")
     with pytest.raises(ValueError, match=r"organs.yaml:3: the volume has no voxel of 'spleen'"):
         load_scene(path)
 
 
-def sphere(center: tuple[float, ...], radius: float) -> np.ndarray:
+def sphere(center: tuple[float, ...], radius: float) -> ndarray:
     """Voxels of a ball on a grid of 60 x 60 x 40, which are 1 x 1 x 1.5 mm."""
     axes = [np.arange(n) * s for n, s in zip((60, 60, 40), GRID, strict=True)]
     return norm(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1) - center, axis=-1) < radius
@@ -124,7 +126,7 @@ PARTS = {"liver": sphere((30, 30, 30), 20), "tumor": sphere((24, 30, 30), 6), "k
 """The tumour lies in the liver, and of the kidney a part."""
 
 
-def write_layers(path: Path, layers: list[np.ndarray], fields: dict[str, object]) -> Path:
+def write_layers(path: Path, layers: list[ndarray], fields: dict[str, object]) -> Path:
     """A segmentation as 3D Slicer writes it, with the layers as first axis."""
     header = {"space": "left-posterior-superior", "kinds": ["list", "domain", "domain", "domain"]}
     directions = np.vstack([np.full(3, np.nan), np.diag(GRID * [-1, -1, 1])])
@@ -212,7 +214,7 @@ def test_what_mereo_writes_for_slicer_comes_back_with_all_letters_of_its_names_a
     assert_array_equal(volume.labels[0], labels)
 
 
-def write_parts(folder: Path, **changes: np.ndarray) -> list[Path]:
+def write_parts(folder: Path, **changes: ndarray) -> list[Path]:
     folder.mkdir(exist_ok=True)
     for name, mask in {**PARTS, **changes}.items():
         image = nibabel.Nifti1Image(mask.astype(np.uint8), np.diag([*GRID, 1.0]))
@@ -243,7 +245,7 @@ def test_one_volume_for_each_segment_is_one_object(tmp_path: Path) -> None:
 @pytest.mark.parametrize("cells", [40, 64, 128])
 def test_thin_segments_keep_their_volume_in_thick_slices(cells: int, tmp_path: Path) -> None:
     """A vein of 9 mm along x in a liver, and slices of 5 mm: a smoothing by the slices would leave nothing of it."""
-    labels = np.zeros((120, 80, 20), dtype=np.uint8)
+    labels = np.zeros((120, 80, 20), np.uint8)
     x, y, z = np.meshgrid(*(np.arange(n) * s for n, s in zip(labels.shape, (1, 1, 5), strict=True)), indexing="ij")
     labels[((x - 60) / 55) ** 2 + ((y - 40) / 38) ** 2 + ((z - 47) / 45) ** 2 < 1] = 1
     labels[((y - 40) ** 2 + (z - 47) ** 2 < 4.5**2) & (abs(x - 60) < 45)] = 2
@@ -258,7 +260,7 @@ def test_thin_segments_keep_their_volume_in_thick_slices(cells: int, tmp_path: P
 
 
 def test_what_is_lost_is_reported_and_what_is_too_thin_can_be_left_out(tmp_path: Path) -> None:
-    labels = np.zeros((100, 100, 40), dtype=np.int64)
+    labels = np.zeros((100, 100, 40), np.int64)
     labels[5:95, 5:95, 5:20], labels[10:90, 10:90, 30], labels[50, 50, 25] = 1, 2, 3
     file = write_nifti(tmp_path / "ct.nii.gz", labels)
     with pytest.warns(LabelWarning, match=r"^segment 'sheet' keeps 8\d% of its volume on a grid of 20 cells: raise"):
@@ -311,9 +313,9 @@ def test_faces_without_area_and_edges_of_many_faces_are_no_trouble() -> None:
     thin = np.concatenate([BOX.faces, [[0, 1, 1], [0, 0, 0]]])
     assert len(split_at_creases(Segment("thin", BOX.color, BOX.vertices, thin))[0].vertices) == 24
     shared = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4], [1, 0, 5]])
-    fan = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], dtype=float)
+    fan = np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]], float)
     check(Segment("fan", BOX.color, fan, shared))
-    none = Segment("none", BOX.color, np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    none = Segment("none", BOX.color, np.empty((0, 3)), np.empty((0, 3), np.int64))
     assert split_at_creases(none)[0] is none
 
 

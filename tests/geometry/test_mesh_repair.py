@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from math import nan
 from pathlib import Path
 
 import manifold3d
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 import yaml
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -140,7 +142,7 @@ def test_what_is_too_thin_for_the_finest_cells_is_said() -> None:
 
 def test_all_faults_of_a_segment_are_named_at_once() -> None:
     crossing = joined(ball((0, 0, 0), 2.0), ball((2, 0, 0), 2.0), ball((9, 0, 0), 0.05, level=1))
-    vertices = np.concatenate([crossing.vertices, [[np.nan, 0, 0]]])
+    vertices = np.concatenate([crossing.vertices, [[nan, 0, 0]]])
     faces = crossing.faces.copy()
     faces[[10, 400]] = faces[[10, 400], ::-1]
     first = faces[0]
@@ -180,7 +182,7 @@ def test_what_a_cut_drops_is_said_with_its_share() -> None:
 
 
 @pytest.mark.parametrize("axes", [np.array([[1, 2, 3]]), np.array([[1, 2, 3], [3, -1, 2]])])
-def test_a_line_or_plane_in_any_direction_is_no_solid(axes: np.ndarray) -> None:
+def test_a_line_or_plane_in_any_direction_is_no_solid(axes: ndarray) -> None:
     places = default_rng(0).random((12, len(axes))) @ axes
     for vertices in (places, places.astype(np.float32).astype(float)):
         health = examine(Segment("part", (1, 2, 3), vertices, np.arange(12).reshape(4, 3)))
@@ -244,7 +246,7 @@ def test_what_is_no_solid_may_have_fewer_faces(tmp_path: Path, monkeypatch: pyte
 
 
 def test_nothing_is_made_of_nothing() -> None:
-    empty = Segment("part", (1, 2, 3), np.full((3, 3), np.nan), np.array([[0, 1, 2]]))
+    empty = Segment("part", (1, 2, 3), np.full((3, 3), nan), np.array([[0, 1, 2]]))
     assert examine(empty).hopeless
     with pytest.raises(ValueError, match="'part' has no surface that could be repaired"):
         repaired(empty)
@@ -326,7 +328,7 @@ def test_parts_of_a_model_get_files_of_their_own(tmp_path: Path, capsys: pytest.
 WHOLE = ball((0, 0, 0), 2.0, level=3)
 
 
-def nodes(*axes: np.ndarray) -> np.ndarray:
+def nodes(*axes: ndarray) -> ndarray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
 
 
@@ -341,7 +343,7 @@ def crossing() -> Segment:
     return replace(joined(WHOLE, ball((1.5, 0, 0), 2.0, level=3)), solid=False)
 
 
-def truth(points: np.ndarray, part: Segment) -> np.ndarray:
+def truth(points: ndarray, part: Segment) -> ndarray:
     centers = [(0, 0, 0), (1.5, 0, 0)][: 1 + (len(part.vertices) > len(WHOLE.vertices))]
     return np.min([norm(points - center, axis=-1) for center in centers], axis=0) - 2.0
 
@@ -361,7 +363,7 @@ def test_the_mark_travels_and_relaxes_the_check_only_for_marked_segments() -> No
     with pytest.raises(ValueError, match="open edges; it must be closed"):
         SegmentedMesh((replace(mesh.segments[0], solid=True),)).check()
     with pytest.raises(ValueError, match="NaN"):
-        SegmentedMesh((replace(mesh.segments[0], vertices=WHOLE.vertices * np.nan),)).check()
+        SegmentedMesh((replace(mesh.segments[0], vertices=WHOLE.vertices * nan),)).check()
 
 
 def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
@@ -380,7 +382,7 @@ def test_a_scene_with_a_hole_warns_and_makes_examples(tmp_path: Path) -> None:
     assert (queries.labels == 1).sum() >= 16 and np.isfinite(queries.distances).all()
 
 
-def convex_polyhedron(seed: int) -> tuple[Segment, np.ndarray, np.ndarray]:
+def convex_polyhedron(seed: int) -> tuple[Segment, ndarray, ndarray]:
     """A random convex hull with the outward unit normals and offsets of its faces' planes."""
     mesh = trimesh.convex.convex_hull(default_rng(seed).normal(size=(60, 3)))
     normal = np.array(mesh.face_normals)
@@ -414,7 +416,7 @@ def test_outside_a_box_distance_and_direction_have_closed_forms() -> None:
 def test_a_point_on_the_surface_takes_the_outward_normal() -> None:
     solids = Solids(one(box((0, 0, 0), (2, 2, 2))))
     points = np.array([[2.0, 0.7, 0.4], [0.3, 0.0, 1.1]])
-    distance, direction = signed_distance_and_direction(solids, points, np.zeros(2, dtype=np.uint8))
+    distance, direction = signed_distance_and_direction(solids, points, np.zeros(2, np.uint8))
     assert np.allclose(distance, 0) and np.allclose(direction, [[1, 0, 0], [0, -1, 0]])
 
 

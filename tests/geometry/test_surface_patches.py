@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -15,11 +16,11 @@ from mereo.geometry.surface_patches import roughness, smoothed, surface_points
 from mereo.geometry.transforms import longest_side
 
 
-def rays(size: int = 96) -> np.ndarray:
+def rays(size: int = 96) -> ndarray:
     return Camera.from_fov(size, size, 0.5).directions()
 
 
-def plate(size: int = 96, half: float = 0.5, rim: int = 2) -> tuple[np.ndarray, np.ndarray]:
+def plate(size: int = 96, half: float = 0.5, rim: int = 2) -> tuple[ndarray, ndarray]:
     """Slanted round plate, half of the image wide, and a rim of the wall behind it; whether each is of the plate."""
     line = (np.arange(size) - (size - 1) / 2) / (size / 2)
     radius = np.hypot(*np.meshgrid(line, line))
@@ -76,12 +77,12 @@ def test_points_closer_than_their_noise_are_a_surface() -> None:
 SIGHT = Camera.from_fov(48, 48, 0.5).directions().reshape(-1, 3)
 
 
-def plane(tilt: float) -> Float[np.ndarray, "n 3"]:
+def plane(tilt: float) -> Float[ndarray, "n 3"]:
     normal = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
     return SIGHT * (normal[2] * 50.0 / (SIGHT @ normal))[:, None]
 
 
-def noisy(points: Float[np.ndarray, "n 3"], std: float) -> Float[np.ndarray, "n 3"]:
+def noisy(points: Float[ndarray, "n 3"], std: float) -> Float[ndarray, "n 3"]:
     return points * (1.0 + default_rng(2).normal(scale=std / 50.0, size=(len(points), 1)))
 
 
@@ -140,7 +141,7 @@ def test_a_random_subset_is_the_same_every_time(limit: int) -> None:
     assert limit < 50 or chosen is points
 
 
-def wall(noise: float) -> Float[np.ndarray, "n 3"]:
+def wall(noise: float) -> Float[ndarray, "n 3"]:
     directions = Camera.from_fov(200, 200, 0.6).directions().reshape(-1, 3)
     return directions * (50.0 + noise * default_rng(5).normal(size=(len(directions), 1)))
 
@@ -170,7 +171,7 @@ def test_points_on_one_line_of_sight_are_few_already_or_parted(count: int) -> No
     assert 1 <= len(means_along_sight(points, 1)) <= count
 
 
-def lattice(side: int) -> np.ndarray:
+def lattice(side: int) -> ndarray:
     return np.stack(np.meshgrid(*[np.arange(side)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(float)
 
 
@@ -184,7 +185,7 @@ def test_on_a_lattice_the_choice_is_exact_and_ties_go_to_smaller_coordinates() -
 
 
 @pytest.mark.parametrize("points", [lattice(4), default_rng(2).normal(size=(200, 3))], ids=["ties", "random"])
-def test_the_points_chosen_do_not_depend_on_their_order(points: np.ndarray) -> None:
+def test_the_points_chosen_do_not_depend_on_their_order(points: ndarray) -> None:
     expected = points[farthest_point_order(points, 50)]
     for seed in range(4):
         shuffled = default_rng(seed).permutation(points)

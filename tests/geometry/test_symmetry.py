@@ -5,12 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import trimesh
+from numpy import ndarray
+from numpy.linalg import det
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 from shapes import segment
+from trimesh.creation import box, cylinder, icosphere
 
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.mesh import Nested, SegmentedMesh
 from mereo.geometry.metrics import with_segments_exchanged
 from mereo.geometry.symmetry import describe_symmetries, find_symmetries
 from mereo.geometry.transforms import fit_rigid, rigid, transform_points
@@ -18,7 +21,7 @@ from mereo.geometry.transforms import fit_rigid, rigid, transform_points
 POSE = rigid(Rotation.from_euler("xyz", [20, 30, 40], degrees=True).as_matrix(), np.array([5.0, -3.0, 8.0]))
 
 
-def posed(*parts: trimesh.Trimesh, pose: np.ndarray = POSE, nested: tuple[tuple[str, str], ...] = ()) -> SegmentedMesh:
+def posed(*parts: trimesh.Trimesh, pose: ndarray = POSE, nested: Nested = ()) -> SegmentedMesh:
     segments = (replace(segment(part), name="abc"[i]) for i, part in enumerate(parts))
     return SegmentedMesh(tuple(segments), nested).transformed(pose)
 
@@ -27,16 +30,16 @@ def moved(part: trimesh.Trimesh, x: float, y: float = 0.0, z: float = 0.0) -> tr
     return part.copy().apply_translation((x, y, z))
 
 
-CUBOID, BALL = trimesh.creation.box((20, 30, 50)), trimesh.creation.icosphere(radius=20, subdivisions=4)
+CUBOID, BALL = box((20, 30, 50)), icosphere(radius=20, subdivisions=4)
 
 
 @pytest.mark.parametrize(
     ("part", "count"),
     [
         (CUBOID, 3),
-        (trimesh.creation.box((20, 20, 50)), 7),
-        (trimesh.creation.cylinder(15, 50, sections=6), 11),
-        (trimesh.creation.cylinder(10, 50, sections=64), 2),  # about its axis, and over end
+        (box((20, 20, 50)), 7),
+        (cylinder(15, 50, sections=6), 11),
+        (cylinder(10, 50, sections=64), 2),  # about its axis, and over end
         (trimesh.creation.cone(10, 50, sections=64), 1),
         (BALL, 1),
     ],
@@ -63,8 +66,8 @@ def test_an_axis_is_named_in_the_frame_of_the_object() -> None:
 def test_segments_that_change_places_are_told_from_those_that_land_on_none() -> None:
     halves = find_symmetries(posed(moved(CUBOID, -10), moved(CUBOID, 10)), 0.3)
     assert {(symmetry.lands_on, symmetry.swaps) for symmetry in halves} == {((0, 1), False), ((1, 0), True)}
-    core = trimesh.creation.icosphere(radius=5)
-    beam = trimesh.creation.box((20, 4, 4))  # it would survive a half turn
+    core = icosphere(radius=5)
+    beam = box((20, 4, 4))  # it would survive a half turn
     (bottle,) = find_symmetries(posed(beam, moved(trimesh.creation.cone(15, 60, sections=64), 0, 0, -20)), 0.3)
     assert bottle.angle is None and bottle.lands_on == (None, 1)
     (hidden,) = find_symmetries(posed(moved(core, 8), BALL, nested=(("a", "b"),)), 0.3)
@@ -73,7 +76,7 @@ def test_segments_that_change_places_are_told_from_those_that_land_on_none() -> 
 
 
 def test_a_small_part_on_the_surface_breaks_the_symmetry() -> None:
-    knob = trimesh.creation.icosphere(radius=2)
+    knob = icosphere(radius=2)
     assert find_symmetries(posed(CUBOID, moved(knob, 12, 3)), 0.3) == ()
     assert len(find_symmetries(posed(CUBOID, moved(knob, 2, 3)), 0.3)) == 3, "what is inside is not seen"
     with pytest.raises(ValueError, match="the tolerance is 0; it must be above 0"):
@@ -105,7 +108,7 @@ def test_a_fit_of_noisy_pairs_is_the_one_of_scipy_and_nothing_near_it_is_better(
     expected = Rotation.align_vectors(target - aim, source - middle, weights=weights)[0].as_matrix()
     assert_allclose(found, rigid(expected, aim - expected @ middle), atol=1e-9)
 
-    def error(motion: np.ndarray) -> float:
+    def error(motion: ndarray) -> float:
         return float(weights @ np.sum((transform_points(motion, source) - target) ** 2, axis=1))
 
     for _ in range(50):
@@ -123,4 +126,4 @@ def test_mirrored_points_are_turned_not_mirrored() -> None:
     source = default_rng(3).normal(size=(30, 3))
     rotation = fit_rigid(source, source * [-1, 1, 1])[:3, :3]
     assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
-    assert np.linalg.det(rotation) == pytest.approx(1.0)
+    assert det(rotation) == pytest.approx(1.0)

@@ -107,7 +107,7 @@ TORCH = f"imports torch, which only {', '.join(rules.MAY_IMPORT['torch'])} may"
 OBJECTS = f"imports mereo_objects, which only {', '.join(SATELLITES['mereo_objects'])} may"
 LAZY = "def f():\n    from mereo_objects.assets import get"
 
-FAULTS: list[tuple[Rule, dict[str, str], list[str]]] = [
+FAULTS = [
     (upward_imports, {MESH: "import mereo.io.readers", **LATER}, [f"{MESH}:1 {READERS}"]),
     (upward_imports, {MESH: "from mereo.io import readers", **LATER}, [f"{MESH}:1 {READERS}"]),
     (upward_imports, {MESH: "def f():\n    from mereo.io.readers import read", **LATER}, [f"{MESH}:2 {READERS}"]),

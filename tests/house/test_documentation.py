@@ -120,7 +120,7 @@ def exists(name: str) -> bool:
     depth = next(n for n in range(len(parts), 0, -1) if is_module(ROOT.joinpath("src", *parts[:n])))
     if depth == len(parts):
         return True  # not imported: some modules need an extra
-    found: object = importlib.import_module(".".join(parts[:depth]))
+    found = importlib.import_module(".".join(parts[:depth]))
     for part in parts[depth:]:
         if not hasattr(found, part) and part not in getattr(found, "__annotations__", {}):
             return False

@@ -7,15 +7,15 @@ import tomllib
 from dataclasses import asdict, replace
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import yaml
+from folder_contents import run_mereo
+from numpy.random import default_rng
 from safetensors.torch import load_file
 
-from mereo import __main__ as command_line
 from mereo.models.weights import PACKED, _pack, _unpack, load_model, save_model
 from mereo.models.weights_place import find_weights, shipped_names
 from mereo.synthesis.config import SENSORS, SensorConfig
@@ -50,7 +50,7 @@ def test_the_file_answers_as_the_weights_and_the_card_knows_it(tmp_path: Path) -
     released = load_model(path)
     assert released.statistical_model is not None and released.statistical_model.rest.names == model.names
     assert released.statistical_model.source_frame is not None
-    points = np.random.default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3))
+    points = default_rng(0).normal((0, 0, 0.6), 0.04, (600, 3))
     # float16 weights are read as they were; the template is rounded to bytes
     for key, value in released.network.state_dict().items():
         before = model.network.state_dict()[key]
@@ -158,7 +158,7 @@ def test_what_cannot_be_released_is_refused(tmp_path: Path, capsys: pytest.Captu
         (["--name", "b", "--tests", str(other)], "is a test of base, but the weights know body, head"),
         (["--name", "b", "--tests", str(tmp_path)], "has no metrics.json; --tests takes folders that mereo evaluate"),
     ):
-        assert command_line.main(["release", "bunny", "--output", str(tmp_path / "out"), *arguments]) != 0
+        assert run_mereo("release", "bunny", "--output", tmp_path / "out", *arguments) != 0
         assert said in " ".join(capsys.readouterr().err.split())
         assert not (tmp_path / "out").exists()
 
@@ -203,7 +203,7 @@ def test_the_image_runs_mereo_as_nobody_special() -> None:
 def test_workflows_call_what_there_is(path: Path) -> None:
     text = path.read_text("utf-8")
     assert all(re.search(r": [\w-]+/[\w-]+@[0-9a-f]{40} # v\d", line) for line in text.splitlines() if "uses:" in line)
-    content: dict[Any, Any] = yaml.safe_load(text)
+    content = yaml.safe_load(text)
     assert content[True], "`on`, which YAML 1.1 takes for a truth value"
     assert content["permissions"] == {"contents": "read"}
     for job in content["jobs"].values():

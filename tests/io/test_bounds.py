@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
+from folder_contents import run_mereo
 
 import mereo.__main__ as command_line
 from mereo.cli import answers, scenes, tools, training
@@ -93,7 +94,7 @@ def test_an_option_out_of_its_bounds_is_refused_before_anything_is_read_or_writt
 
 def test_the_help_shows_bounds(capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit):
-        command_line.main(["bench", "--help"])
+        run_mereo("bench", "--help")
     assert "(default: 7; at least 1)" in " ".join(capsys.readouterr().out.replace("│", "").split())
 
 
@@ -112,7 +113,7 @@ def test_settings_of_a_file_have_the_types_of_their_fields() -> None:
 # --- settings of networks have parts, and are flat wherever they are written ------------------------------------------
 
 
-OTHERS: dict[type, Any] = {
+OTHERS = {
     bool: lambda value: not value,
     int: lambda value: value + 4,
     float: lambda value: value + 0.25,

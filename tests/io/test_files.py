@@ -8,12 +8,15 @@ import sys
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from math import nan
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
+from folder_contents import refusal
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -27,11 +30,11 @@ from mereo.io.readers import InputWarning, is_depth_image, read_depth_image, rea
 POINTS = default_rng(0).normal(size=(57, 3)).astype(np.float32) + np.float32(3)
 
 
-def text(points: np.ndarray, separator: str, *, extra: str = "") -> str:
+def text(points: ndarray, separator: str, *, extra: str = "") -> str:
     return "".join(separator.join(repr(v) for v in row) + extra + "\n" for row in points.tolist())
 
 
-CLOUDS: dict[str, bytes] = {
+CLOUDS = {
     "ascii.ply": save_ply(POINTS, "ascii"),
     "little.ply": save_ply(POINTS, "binary_little_endian"),
     "big.ply": save_ply(POINTS, "binary_big_endian"),
@@ -54,7 +57,7 @@ CLOUDS: dict[str, bytes] = {
 @pytest.mark.parametrize("name", CLOUDS)
 def test_every_format_gives_back_the_points(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(CLOUDS[name])
-    assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(np.float64))
+    assert_array_equal(read_point_cloud(tmp_path / name).points, POINTS.astype(float))
 
 
 def test_whole_numbers_between_commas_are_numbers(tmp_path: Path) -> None:
@@ -74,7 +77,7 @@ def test_arrays_in_numpy_files(tmp_path: Path) -> None:
 
 def test_missing_points_are_refused_with_the_cure_or_dropped(tmp_path: Path) -> None:
     points = POINTS.copy()
-    points[3], points[5, 1], points[9] = np.nan, np.inf, 0
+    points[3], points[5, 1], points[9] = nan, np.inf, 0
     for name, content in (("a.ply", save_ply(points, "binary_little_endian")), ("b.pcd", save_pcd(points, "binary"))):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=r"3 of 57 points without a measurement.*--drop-invalid"):
@@ -83,14 +86,14 @@ def test_missing_points_are_refused_with_the_cure_or_dropped(tmp_path: Path) -> 
         assert_array_equal(read_point_cloud(tmp_path / name, drop_invalid=True).points, kept)
 
 
-def npy(array: np.ndarray) -> bytes:
+def npy(array: ndarray) -> bytes:
     np.save(file := io.BytesIO(), array)
     return file.getvalue()
 
 
 PLY, PCD = save_ply(POINTS, "binary_little_endian"), save_pcd(POINTS, "binary")
 PACKED = struct.pack("<II", 5, 80) + bytes([1, 65, 66, 32, 10])
-BAD_CLOUDS: dict[str, tuple[bytes, str]] = {
+BAD_CLOUDS = {
     "empty.ply": (b"", "is empty"),
     "no vertices.ply": (save_ply(POINTS[:0], "ascii"), "0 vertices"),
     "cut at a line.ply": (b"\n".join(CLOUDS["ascii.ply"].split(b"\n")[:-5]), "53 of 57|54 of 57"),
@@ -101,7 +104,7 @@ BAD_CLOUDS: dict[str, tuple[bytes, str]] = {
     "all commas.csv": (b"0,51,-0,95,0,35\n0,52,-0,09,0,36\n", "its first row is '0,51,-0,95,0,35', where commas are "),
     "titled commas.csv": (b"x,y,z\n1,51,-1,95,7,35\n", "commas are between numbers and seem to be in them: export it"),
     "really ply.pcd": (CLOUDS["ascii.ply"], "no PCD header"),
-    "pickle.npy": (npy(np.array([{}], dtype=object)), "cannot be read"),
+    "pickle.npy": (npy(np.array([{}], object)), "cannot be read"),
     "transposed.npy": (npy(POINTS.T), r"shape is \(3, 57\)"),
     "words.npy": (npy(np.array([["a", "b", "c"]])), "not a number"),
     "mesh.stl": (b"solid", "is a mesh, not what a camera has measured, .*: give the frame, and the mesh as the object"),
@@ -193,7 +196,7 @@ def test_bad_meshes_get_one_sentence(tmp_path: Path) -> None:
             read_segmented_mesh(tmp_path / name)
 
 
-def write_glb(path: Path, arrays: list[np.ndarray], **tree: Any) -> Path:
+def write_glb(path: Path, arrays: list[ndarray], **tree: Any) -> Path:
     """GLB file of a tree whose accessor i is array i, in one buffer: its second chunk, unless the tree names others."""
     kinds = {"f4": 5126, "u2": 5123, "i2": 5122, "i1": 5120}
     content = b"".join(array.tobytes() for array in arrays)
@@ -327,7 +330,7 @@ def test_a_3mf_file_that_unpacks_to_more_than_the_limit_is_refused_unread(
         read_segmented_mesh(tmp_path / "a.3mf")
 
 
-def write_materials(path: Path, parts: list[tuple[str, np.ndarray]]) -> Path:
+def write_materials(path: Path, parts: list[tuple[str, ndarray]]) -> Path:
     """OBJ file of boxes' faces, of which each material has its own vertices."""
     lines = list[str]()
     for index, (material, faces) in enumerate(parts):
@@ -352,7 +355,7 @@ def test_materials_of_an_obj_file_are_segments_where_closed_or_it_is_said(tmp_pa
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 
 
-def save_depth(path: Path, values: np.ndarray) -> Path:
+def save_depth(path: Path, values: ndarray) -> Path:
     Image.fromarray(values).save(path)
     return path
 
@@ -380,9 +383,8 @@ def test_a_bad_depth_image_gets_one_sentence(tmp_path: Path) -> None:
         (good, 0.0, "depth scale is 0.0"),
     ):
         save_depth(path, values)
-        with pytest.raises(ValueError, match=expected) as caught:
+        with refusal(expected):
             read_depth_image(path, CAMERA, scale)
-        assert "\n" not in str(caught.value)
     noise = default_rng(0).integers(500, 1500, (60, 80)).astype(np.uint16)
     path.write_bytes(save_depth(path, noise).read_bytes()[:3000])
     with refused(path, "cannot be read as a depth image"):
@@ -408,7 +410,7 @@ def test_masks_of_all_kinds_agree(tmp_path: Path) -> None:
         assert_array_equal(read_mask(tmp_path / f"{name}.png"), truth, err_msg=name)
 
 
-def disk(*values: int) -> np.ndarray:
+def disk(*values: int) -> ndarray:
     """Nested disks of these values on an image of 0."""
     row, column = np.mgrid[:40, :60]
     radius = np.hypot(row - 20, column - 30)
@@ -467,7 +469,7 @@ def test_what_is_opaque_is_the_object(tmp_path: Path) -> None:
 
 MILLIMETRES = default_rng(5).integers(400, 9000, (6, 8)).astype(np.uint16)
 MILLIMETRES[2, 3] = 0
-METRES = np.where(MILLIMETRES > 0, MILLIMETRES / np.float32(1000), np.nan).astype(np.float32)
+METRES = np.where(MILLIMETRES > 0, MILLIMETRES / np.float32(1000), nan).astype(np.float32)
 
 
 @pytest.mark.parametrize("name", ["short.tif", "float.tiff", "big.tif", "short.npy", "double.npy"])
@@ -528,10 +530,10 @@ def test_normals_of_a_ply_file_are_read_with_its_points(tmp_path: Path) -> None:
     (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())
     for name in ("a.ply", "b.ply"):
         cloud = read_point_cloud(tmp_path / name)
-        assert_array_equal(cloud.points, POINTS.astype(np.float64))
+        assert_array_equal(cloud.points, POINTS.astype(float))
         length = norm(normals, axis=1, keepdims=True)
         assert_allclose(cloud.normals, normals / length, atol=1e-6)
-    rows[3], rows[5, 3] = 0.0, np.nan
+    rows[3], rows[5, 3] = 0.0, nan
     (tmp_path / "b.ply").write_bytes(head.format("binary_little_endian").encode() + rows.tobytes())
     cloud = read_point_cloud(tmp_path / "b.ply", drop_invalid=True)
     assert cloud.normals is not None and len(cloud.normals) == len(cloud) == 56 and np.isfinite(cloud.normals).all()

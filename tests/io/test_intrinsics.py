@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folder_contents import refusal
 
 from mereo.geometry.camera import Camera
 from mereo.io.intrinsics import CameraWarning, read_camera, read_intrinsics
@@ -61,9 +62,8 @@ def test_all_forms_of_intrinsics_mean_the_same_camera(tmp_path: Path, name: str)
 )
 def test_bad_intrinsics_get_one_sentence(tmp_path: Path, content: str, expected: str) -> None:
     (tmp_path / "c.json").write_text(content)
-    with pytest.raises(ValueError, match=expected) as caught:
+    with refusal(expected):
         read_camera(tmp_path / "c.json")
-    assert "\n" not in str(caught.value)
 
 
 PADDED = np.pad(np.array(K), ((0, 1), (0, 1))) + np.diag([0, 0, 0, 1])

@@ -8,7 +8,6 @@ import signal
 import stat
 import subprocess
 import sys
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
@@ -148,7 +147,7 @@ def test_what_mereo_wrote_is_replaced_when_forced(tmp_path: Path) -> None:
     assert read(tmp_path / "elsewhere") == "third"
 
 
-CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
+CHANGES = {
     "another file": (
         lambda folder: (folder / "deep/mine.txt").write_text("precious"),
         r"holds deep/mine\.txt, not written by this version of mereo or .*: move that away, or choose another",
@@ -165,7 +164,7 @@ CHANGES: dict[str, tuple[Callable[[Path], object], str]] = {
 def test_a_folder_with_anything_else_in_it_is_kept_and_refused_before_the_work(change: str, tmp_path: Path) -> None:
     make, sentence = CHANGES[change]
     write(tmp_path / "out", "first")
-    before: dict[str, bytes] = {}
+    before = {}
     with (
         pytest.raises(FileExistsError, match="out (holds|was written)"),
         new_directory(tmp_path / "out", True) as folder,

@@ -1,6 +1,7 @@
 """Every form of a frame in memory gives the same points; what is none gets one sentence with its cure."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from math import nan
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,7 +11,9 @@ import pytest
 import torch
 import trimesh
 from memory_frames import FORMS, GRID, POINTS, Tensor, TensorMap, message, records, with_data
+from numpy import ndarray
 from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
@@ -24,30 +27,30 @@ DEPTH = DepthImage(np.ones((6, 8)), CAMERA)
 def test_every_form_gives_the_same_points(form: str) -> None:
     cloud, lost = points_of(FORMS[form])
     assert isinstance(cloud, PointCloud) and lost == 0
-    assert cloud.points.dtype == np.float64 and type(cloud.points) is np.ndarray
+    assert cloud.points.dtype == np.float64 and type(cloud.points) is ndarray
     assert_array_equal(cloud.points, POINTS)
     assert not is_frame_list(FORMS[form])
 
 
 def test_own_types_are_returned_and_others_are_copied_in_all_their_digits() -> None:
     assert points_of(DEPTH, drop_invalid=True) == (DEPTH, 0)
-    fine = np.random.default_rng(1).normal(size=(9, 3))
+    fine = default_rng(1).normal(size=(9, 3))
     cloud, _ = points_of(fine)
     assert isinstance(cloud, PointCloud)
     assert_array_equal(cloud.points, fine)
     assert not np.shares_memory(cloud.points, fine)
 
 
-def broken(points: np.ndarray) -> np.ndarray:
+def broken(points: ndarray) -> ndarray:
     """The points with three that are no measurements: the second, the fourth and the tenth."""
     made = points.copy().reshape(-1, 3)
-    made[1], made[3, 2], made[9] = np.nan, -np.inf, 0
+    made[1], made[3, 2], made[9] = nan, -np.inf, 0
     return made.reshape(points.shape)
 
 
 MEASURED = np.delete(POINTS, [1, 3, 9], axis=0)
 
-KINDS: dict[str, Callable[[np.ndarray], Any]] = {
+KINDS = {
     "array": lambda points: points,
     "tensor": lambda points: torch.tensor(points, dtype=torch.bfloat16),
     "structured": records,
@@ -57,7 +60,7 @@ KINDS: dict[str, Callable[[np.ndarray], Any]] = {
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("points", [POINTS, GRID], ids=["flat", "organized"])
-def test_missing_points_are_refused_or_dropped_and_counted(kind: str, points: np.ndarray) -> None:
+def test_missing_points_are_refused_or_dropped_and_counted(kind: str, points: ndarray) -> None:
     cure = "leave them out with drop_invalid=True$"
     if points.ndim == 3:
         cure = "organized clouds mark pixels without a measurement so, and drop_invalid=True leaves them out$"
@@ -69,7 +72,7 @@ def test_missing_points_are_refused_or_dropped_and_counted(kind: str, points: np
 
 
 @pytest.mark.parametrize("made", [POINTS, records(POINTS)], ids=["array", "structured"])
-def test_masked_values_are_missing(made: np.ndarray) -> None:
+def test_masked_values_are_missing(made: ndarray) -> None:
     masked = np.ma.masked_array(made)
     masked[4] = np.ma.masked
     with pytest.raises(ValueError, match="has 1 of 12 points without a measurement"):
@@ -104,7 +107,7 @@ def altered(**changes: Any) -> SimpleNamespace:
 
 IMAGE = "is an image of depths, which needs the camera's intrinsics: give intrinsics=, .* or mereo.DepthImage.depth, "
 
-REFUSED: dict[str, tuple[Any, str]] = {
+REFUSED = {
     "number": (3.5, "^the float cannot be read as a frame"),
     "generator": (generated(), "^the generator cannot be read as a frame"),
     "empty tensor map": (SimpleNamespace(point=TensorMap()), "^the SimpleNamespace cannot be read as a frame"),
@@ -124,7 +127,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "ragged": ([[1, 2, 3], [4, 5]], "^the list is no array .its rows differ in length.; n x 3 numbers are needed: "),
     "tensor without values": (torch.ones(9, 3, device="meta"), "^the Tensor is no array"),
     "empty message": (message(POINTS[:0]), "^the PointCloud2 message holds 0 points"),
-    "only NaN": (np.full((6, 3), np.nan), "^all 6 points of the ndarray of shape .6, 3. are NaN, infinite, zero"),
+    "only NaN": (np.full((6, 3), nan), "^all 6 points of the ndarray of shape .6, 3. are NaN, infinite, zero"),
     "fields": (np.ones(9, [("u", "f4"), ("v", "f4")]), "has the fields u, v; x, y and z are needed: rename"),
     "field of words": (np.ones(9, [("x", "f4"), ("y", "U3"), ("z", "f4")]), "^the field 'y' of .* values of type <U3"),
     "field of rows": (np.ones(9, [("x", "f4", 2), ("y", "f4"), ("z", "f4")]), "'x' of .* holds several numbers"),
@@ -143,7 +146,7 @@ def test_what_is_no_frame_gets_one_sentence(case: str) -> None:
     assert "\n" not in sentence and ": " in sentence and not sentence.endswith(".") and "--" not in sentence
 
 
-FRAME_LISTS: dict[str, Any] = {
+FRAME_LISTS = {
     "arrays of equal length": (POINTS, POINTS),
     "arrays of one point": [POINTS[:1], POINTS[:1]],
     "tensors of another library": [Tensor(POINTS)],
@@ -156,7 +159,7 @@ FRAME_LISTS: dict[str, Any] = {
     "messages": [message(POINTS)],
     "with one that is none": [None, POINTS],
 }
-NO_FRAME_LISTS: tuple[Any, ...] = (
+NO_FRAME_LISTS = (
     *([[1, 2, 3], [4, 5, 6], [7, 8, 9]], list(POINTS), list(torch.tensor(POINTS)), list(records(POINTS)), [1, 2, 3]),
     *([], [[], []], [None], np.stack([POINTS, POINTS]), {"a": POINTS}, {"a.ply"}, "ab", Path("a.ply")),
 )
@@ -176,7 +179,7 @@ def test_points_of_a_model_may_be_its_origin_and_must_be_finite() -> None:
         PointCloud(np.array([[0.0, 0, 0], [1, 2, 3]])),
     ):
         assert_array_equal(model_points(form), [[0, 0, 0], [1, 2, 3]])
-    for wrong in ([[0, 0, np.nan]], np.empty((0, 3)), [[1e13, 0, 0]]):
+    for wrong in ([[0, 0, nan]], np.empty((0, 3)), [[1e13, 0, 0]]):
         with pytest.raises(
             ValueError, match=r"of shape .* has no points, or some that are NaN, infinite or beyond 1e.12"
         ):
@@ -199,5 +202,5 @@ def test_normals_of_other_libraries_come_with_the_points() -> None:
     longer, lost = points_of(SimpleNamespace(points=broken(POINTS), normals=3.0 * POINTS), drop_invalid=True)
     assert isinstance(longer, PointCloud) and lost == 3
     assert_allclose(longer.normals, MEASURED / norm(MEASURED, axis=1, keepdims=True))
-    for normals in ([], POINTS[:3], np.full(POINTS.shape, np.nan), "none"):
+    for normals in ([], POINTS[:3], np.full(POINTS.shape, nan), "none"):
         assert points_of(SimpleNamespace(points=POINTS, normals=normals))[0].normals is None  # type: ignore[union-attr]

@@ -12,11 +12,13 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import trimesh
+from folder_contents import run_mereo
 from numpy.testing import assert_allclose
 from page_blocks import ROOT
 
 from mereo import __main__ as command_line
 from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import Names
 from mereo.io import realsense
 from mereo.io.extras import library
 from mereo.io.realsense import camera_frames
@@ -41,7 +43,7 @@ def image(value: int, time_ms: float, clock: str = "global_time", width: int = 6
 def connect(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Connect cameras that deliver these and raise what is an error; after that they are silent."""
 
-    def connected(*delivered: Any, serials: tuple[str, ...] = (SERIAL, "12")) -> MagicMock:
+    def connected(*delivered: Any, serials: Names = (SERIAL, "12")) -> MagicMock:
         sdk, waiting, plugged = MagicMock(), list(delivered), list(serials)
 
         def wait(_: int) -> tuple[bool, Any]:
@@ -106,7 +108,7 @@ def test_a_camera_that_breaks_off_ends_the_stream_with_one_sentence(
 ) -> None:
     sdk = connect(image(0, 0.0), BROKEN[sentence])
     arguments = ["--weights", "rope", "--method", "network", "--surfaces", str(tmp_path / "out")]
-    assert command_line.main(["stream", "realsense", *arguments]) == 2
+    assert run_mereo("stream", "realsense", *arguments) == 2
     out, err = capsys.readouterr()
     assert "measures 0 pixels" in json.loads(out)["error"], "what shows nothing is that frame's error alone"
     assert f"mereo: error: realsense {SERIAL} {sentence}" in err and list(tmp_path.iterdir()) == []
@@ -129,7 +131,7 @@ def test_what_cannot_be_is_said_before_anything_is_loaded(
     sentence: str, connect: Any, capsys: pytest.CaptureFixture
 ) -> None:
     connect(serials=("12",) if "12" in sentence else ())
-    assert command_line.main(["stream", *REFUSED[sentence], "--weights", "none.safetensors"]) == 2
+    assert run_mereo("stream", *REFUSED[sentence], "--weights", "none.safetensors") == 2
     assert sentence in " ".join(capsys.readouterr().err.split())
 
 

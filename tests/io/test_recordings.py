@@ -5,9 +5,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from folder_contents import refusal
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.io.atomic_files import JsonObject
 from mereo.io.config import InputConfig
 from mereo.io.intrinsics import CameraWarning
 from mereo.io.ros_recordings import recorded_frame, recorded_frames
@@ -15,7 +18,7 @@ from mereo.io.sensor_frame import read_frame
 
 pytest.importorskip("rosbags", reason="rosbags comes with the extra sensors")
 
-from recorded_bags import DEPTH_MM, Messages, depth_topics, write_bag
+from recorded_bags import DEPTH_MM, Messages, Topics, depth_topics, write_bag
 
 CAMERA = Camera(8, 6, 10.0, 11.0, 4.0, 3.0)
 
@@ -60,7 +63,7 @@ def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_fram
 
 
 def test_the_unit_is_that_which_the_sdk_of_a_realsense_records(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         depth, unit = make.image(DEPTH_MM[0], "16UC1"), make.types["std_msgs/msg/String"](data="0.000100")
         return {"/a/Depth_0": [depth], "/b": [make.info()], "/a/option/Depth_Units/value": [unit]}
 
@@ -77,7 +80,7 @@ def test_floats_are_metres_in_either_byte_order(tmp_path: Path) -> None:
 
 
 def test_compressed_depth_is_found_beside_compressed_colour(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         return {
             "/camera/color/image_raw/compressed": [make.compressed(DEPTH_MM[0], "bgr8; jpeg compressed bgr8")],
             "/camera/depth/image_raw/compressedDepth": [
@@ -113,17 +116,17 @@ def test_other_compressions_are_refused(tmp_path: Path, format_: str) -> None:
 
 
 def test_point_clouds_keep_their_missing_points_until_asked(tmp_path: Path) -> None:
-    points = np.random.default_rng(1).normal((0, 0, 2), 0.1, (80, 3)).astype(np.float32)
+    points = default_rng(1).normal((0, 0, 2), 0.1, (80, 3)).astype(np.float32)
     points[5] = np.nan
     path = write_bag(tmp_path / "a.mcap", 2, lambda m: {"/points": [m.cloud(points)]})
-    assert_array_equal(recorded_frame(path).read(), points.astype(np.float64))
+    assert_array_equal(recorded_frame(path).read(), points.astype(float))
     with pytest.raises(ValueError, match="1 of 80 points without a measurement.*--drop-invalid"):
         read_frame(path)
     assert len(read_frame(path, InputConfig(drop_invalid=True)).cloud) == 79
 
 
 def test_distortion_counts_unless_the_topic_is_rectified(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         image = make.image(DEPTH_MM[0], "16UC1")
         info = make.info(focal=20.0, distortion=0.2)
         return {"/d/image_raw": [image], "/d/image_rect": [image], "/d/camera_info": [info]}
@@ -135,7 +138,7 @@ def test_distortion_counts_unless_the_topic_is_rectified(tmp_path: Path) -> None
 
 
 def test_one_broken_frame_stops_nothing(tmp_path: Path) -> None:
-    def topics(make: Messages) -> dict[str, list[Any]]:
+    def topics(make: Messages) -> Topics:
         good, odd = make.image(DEPTH_MM[0], "16UC1"), make.image(DEPTH_MM[0, :, :4], "16UC1")
         return {"/d/image": [good, odd, good], "/d/camera_info": [make.info()]}
 
@@ -154,7 +157,7 @@ def test_one_broken_frame_stops_nothing(tmp_path: Path) -> None:
         ({"frame": "scanner"}, "is a recording; those are always in the camera frame"),
     ],
 )
-def test_what_a_recording_does_not_have_is_said(tmp_path: Path, options: dict[str, Any], expected: str) -> None:
+def test_what_a_recording_does_not_have_is_said(tmp_path: Path, options: JsonObject, expected: str) -> None:
     with pytest.raises(ValueError, match=expected):
         read_frame(write_bag(tmp_path / "a.bag", 1, depth_topics), InputConfig(**options))
 
@@ -168,8 +171,7 @@ def test_what_is_no_recording_of_depth_is_said(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"has neither depth images .* only /c \(sensor_msgs/msg/Image\)"):
         recorded_frame(color)
     (tmp_path / "noise.mcap").write_bytes(b"noise" * 50)
-    with pytest.raises(ValueError, match=r"noise.mcap cannot be read as a ROS bag") as caught:
+    with refusal(r"noise.mcap cannot be read as a ROS bag"):
         recorded_frame(tmp_path / "noise.mcap")
-    assert "\n" not in str(caught.value)
     with pytest.raises(FileNotFoundError, match="does not exist; a ROS bag is needed"):
         recorded_frame(tmp_path / "no.bag")

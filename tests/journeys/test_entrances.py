@@ -21,9 +21,8 @@ import mereo
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.conventions import CloudAxes
-from mereo.io.atomic_files import to_json
+from mereo.io.atomic_files import JsonObject, to_json
 from mereo.io.writers.meshes import write_positions_ply
-from mereo.synthesis.config import SensorModel
 from mereo.synthesis.depth_sensor import KINECT_DISPARITY_M, axial_std_m, quantize
 from mereo.visualization.result_files import summary_of
 
@@ -32,7 +31,7 @@ pytestmark = pytest.mark.usefixtures("small_previews")
 RESOLUTION = 12
 
 
-def figures(summary: Answer | dict[str, Any]) -> dict[str, Any]:
+def figures(summary: Answer | JsonObject) -> JsonObject:
     """What of a summary no clock and no name of a file decides, as JSON has it."""
     plain = json.loads(json.dumps(to_json(summary_of(summary) if isinstance(summary, Answer) else summary)))
     return {name: value for name, value in plain.items() if name not in ("timings_s", "title", "source", "weights")}
@@ -63,7 +62,7 @@ def npy(path: Path) -> Path:
 def test_axes_and_unit_are_the_same_beside_the_frame_and_before_it(axes: CloudAxes, tmp_path: Path) -> None:
     points, model = scene(axes)
     np.save(tmp_path / "cloud.npy", points)
-    reading: dict[str, Any] = {"axes": axes, "unit_m": 0.5}
+    reading = {"axes": axes, "unit_m": 0.5}
 
     def found(frame: Any, **given: Any) -> mereo.Result:
         return mereo.reconstruct(frame, model, "network", resolution=RESOLUTION, **given)
@@ -76,7 +75,7 @@ def test_axes_and_unit_are_the_same_beside_the_frame_and_before_it(axes: CloudAx
 
 
 def test_a_list_of_frames_is_a_list_of_answers(result: mereo.Result, tmp_path: Path) -> None:
-    frames: list[Any] = [seen(), PointCloud(seen()), npy(tmp_path / "cloud.npy"), mereo.load_frame(seen())]
+    frames = [seen(), PointCloud(seen()), npy(tmp_path / "cloud.npy"), mereo.load_frame(seen())]
     found = mereo.reconstruct(frames, MODEL, "network", resolution=RESOLUTION)
     assert len(found) == len(frames) and result.unit_m is None and result.seen.frame.axes == "camera"
     for one in found:
@@ -100,7 +99,7 @@ def test_a_depth_image_has_one_answer(tmp_path: Path) -> None:
     np.save(tmp_path / "depth.npy", millimetres)
     write_camera(tmp_path / "camera.json", image.camera)
     wanted = asked(image, unit_m=1.0)
-    scaled: dict[str, Any] = {"intrinsics": tmp_path / "camera.json", "depth_scale": 1000}
+    scaled = {"intrinsics": tmp_path / "camera.json", "depth_scale": 1000}
     for found in (
         asked(millimetres, intrinsics=image.camera, depth_scale=1000),
         asked(millimetres, **scaled),
@@ -113,20 +112,24 @@ def test_a_depth_image_has_one_answer(tmp_path: Path) -> None:
 
 
 CAMERAS, TOOLS = ROOT / "docs" / "cameras.md", ROOT / "docs" / "from-other-tools.md"
-MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
+MODELS = ("structured-light", "time-of-flight")
+
+
+Variables = dict[str, Any]
+"""What a block of code leaves, by name."""
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[str, Any]]:
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Variables]:
     """Run the only block that has a word, next to frame.ply; stand-ins are modules by their names."""
 
-    def run_block(word: str, modules: dict[str, Any]) -> dict[str, Any]:
+    def run_block(word: str, modules: Variables) -> Variables:
         for name, module in modules.items():
             monkeypatch.setitem(sys.modules, name, module)
         monkeypatch.chdir(tmp_path)
         monkeypatch.setattr(mereo, "load_object", lambda _: MODEL, raising=False)
         (code,) = (code for code in blocks(TOOLS, "python") if word in code)
-        names: dict[str, Any] = {}
+        names = {}
         exec(compile(code, word, "exec"), names)
         return names
 
@@ -134,7 +137,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., dict[s
     return run_block
 
 
-def test_open3d(run: Callable[..., dict[str, Any]]) -> None:
+def test_open3d(run: Callable[..., Variables]) -> None:
     cloud = SimpleNamespace(points=np.concatenate([seen(), [[0, 0, 0], [np.nan, 1, 1]]]))
     open3d = MagicMock(**{"io.read_point_cloud.return_value": cloud})
     names = run("import open3d", {"open3d": open3d})
@@ -143,7 +146,7 @@ def test_open3d(run: Callable[..., dict[str, Any]]) -> None:
     assert drawn[0] is cloud and set(names["meshes"]) == set(NAMES[:2]) and len(drawn) == 3
 
 
-def test_slicer(run: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
+def test_slicer(run: Callable[..., Variables], tmp_path: Path) -> None:
     slicer = MagicMock()
     names = run("import slicer", {"slicer": slicer})
     slicer.util.loadSegmentation.assert_called_once_with(str(Path("result/labels.seg.nrrd")))
@@ -160,7 +163,7 @@ def test_the_table_of_distances_follows_the_formulas() -> None:
     row = r"^\| ([\d.]+) \| ([\d.]+), ([\d.]+) \| ([\d.]+) \| ([\d.]+), ([\d.]+) \| (\d+) \| (\d+) \|$"
     rows = re.findall(row, CAMERAS.read_text(), re.M)
     assert len(rows) == 6
-    for z, *stated in np.array(rows, dtype=float).tolist():
+    for z, *stated in np.array(rows, float).tolist():
         at, angles = np.full(2, z), np.deg2rad([0.0, 60.0])
         light, flight = (1e3 * axial_std_m(at, angles, model) for model in MODELS)
         assert stated[:5] == pytest.approx((*light, 1e3 * z**2 / KINECT_DISPARITY_M, *flight), abs=0.0051)

@@ -14,6 +14,7 @@ from torch.distributed.run import get_args_parser
 
 import mereo.__main__ as command_line
 from mereo.cli.training import Generate, Train
+from mereo.io.atomic_files import JsonObject
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 EXPECTED = {
@@ -144,7 +145,7 @@ def test_kuberay_starts_what_it_should() -> None:
         assert_on_the_volume(group["template"]["spec"], command.output)
 
 
-def assert_on_the_volume(pod: dict[str, Any], *folders: Path) -> None:
+def assert_on_the_volume(pod: JsonObject, *folders: Path) -> None:
     """These folders lie on a volume of the pod that outlives it."""
     (container,) = pod["containers"]
     claimed = {volume["name"] for volume in pod["volumes"] if "persistentVolumeClaim" in volume}

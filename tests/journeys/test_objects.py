@@ -12,7 +12,8 @@ import pytest
 import trimesh
 from angle import write_angle
 from fit_cases import seen
-from folder_contents import read_json
+from folder_contents import read_json, run_mereo
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
@@ -21,8 +22,6 @@ import mereo
 from mereo import __main__ as command_line
 from mereo.cli.answers import ReconstructCommand, StreamCommand
 from mereo.cli.options import loaded_object
-from mereo.fitting.config import AnswerMethod
-from mereo.fitting.registration.register import Registrar
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import Scores, grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.geometry.transforms import rigid as rigid_transform
@@ -76,7 +75,7 @@ def scene(angle: mereo.Object) -> Scene:
 
 
 @pytest.fixture(scope="module")
-def points(scene: Scene, folder: Path) -> np.ndarray:
+def points(scene: Scene, folder: Path) -> ndarray:
     """View of the angle in a random state, in metres; also in ``frame.npy``."""
     assert scene.unit_m is not None
     seen = sample_view(scene, GenerateConfig(), example_rng(1000, 2)).depth.to_points().points * scene.unit_m
@@ -85,7 +84,7 @@ def points(scene: Scene, folder: Path) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def found(angle: mereo.Object, points: np.ndarray) -> mereo.Result:
+def found(angle: mereo.Object, points: ndarray) -> mereo.Result:
     return mereo.reconstruct(points, angle, resolution=48, label_points=True, unit_m=1.0)
 
 
@@ -172,7 +171,7 @@ def test_what_is_said_of_a_file_is_said_once(tmp_path: Path) -> None:
     assert len(caught) == 1
 
 
-def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points: np.ndarray) -> None:
+def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points: ndarray) -> None:
     tracker = mereo.Tracker(angle)
     first, second = (tracker.follow(points, 0.03 * step, unit_m=1.0) for step in range(2))
     assert (first.tracked, second.tracked) == (False, True)
@@ -180,7 +179,7 @@ def test_a_tracker_begins_with_a_search_and_follows(angle: mereo.Object, points:
 
 
 def test_an_initial_pose_takes_the_place_of_a_search(
-    found: mereo.Result, angle: mereo.Object, points: np.ndarray, meshes: list[str], tmp_path: Path
+    found: mereo.Result, angle: mereo.Object, points: ndarray, meshes: list[str], tmp_path: Path
 ) -> None:
     again = mereo.reconstruct(points, angle, resolution=24, unit_m=1.0, initial_pose=found.pose)
     assert again.located_by == "pose" and again.pose is not None and found.pose is not None
@@ -190,7 +189,7 @@ def test_an_initial_pose_takes_the_place_of_a_search(
     np.save(tmp_path / "frame.npy", points)
     given = ["--unit-m", "1", "--initial-pose", str(tmp_path / "first/summary.json"), "--output", str(tmp_path / "out")]
     objects = ["--object", *meshes, "--units", "mm", "--resolution", "24"]
-    assert command_line.main(["reconstruct", str(tmp_path / "frame.npy"), *objects, *given]) in (0, 3, 4)
+    assert run_mereo("reconstruct", tmp_path / "frame.npy", *objects, *given) in (0, 3, 4)
     summary = read_json(tmp_path / "out/summary.json")
     assert summary["registration"]["located_by"] == "pose"
     assert_allclose(summary["pose"], again.pose, atol=1e-4)
@@ -238,7 +237,7 @@ def test_what_is_defined_in_the_meshes_is_carried(found: mereo.Result, scene: Sc
     assert_allclose(near, np.repeat(origin, 2, axis=0), atol=1e-9)  # of the files: a point like any other
 
 
-def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: np.ndarray) -> None:
+def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: ndarray) -> None:
     answerer = Answerer.of(Setup((Served("angle", object=tuple(meshes)),)))
     (facts,) = answerer.ready().facts
     assert (facts["scene"], facts["device"], facts["calibrated"]) == ("long", None, False)
@@ -251,22 +250,22 @@ def test_it_is_served_without_weights(folder: Path, meshes: list[str], points: n
 def test_its_frame_and_its_result_are_shown(
     found: mereo.Result, folder: Path, meshes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened: list[OpenPage] = []
+    opened = []
     monkeypatch.setattr(OpenPage, "stay", lambda page, _: opened.append(page) or page)  # type: ignore[func-returns-value]
     found.save(tmp_path / "out")
     assert (tmp_path / "out/state.json").is_file()
     frame = [str(folder / "frame.npy"), "--unit-m", "1", "--resolution", "24", "--object", *meshes, "--units", "mm"]
     for shown in (frame, [str(tmp_path / "out")]):
-        assert command_line.main(["view", *shown, "--port", "0"]) == 0
+        assert run_mereo("view", *shown, "--port", "0") == 0
         opened.pop().close()
 
 
 def test_without_a_frame_its_laboratory_opens(meshes: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    opened: list[tuple[Scene, object, Registrar]] = []
+    opened = []
     page = OpenPage(SimpleNamespace(get_port=lambda: 1, stop=lambda: None))
     monkeypatch.setattr(OpenPage, "stay", lambda page, _: page)
     monkeypatch.setattr("mereo.api.view.open_laboratory", lambda *given: opened.append(given[:3]) or page)
-    assert command_line.main(["view", "--object", *meshes, "--units", "mm"]) == 0
+    assert run_mereo("view", "--object", *meshes, "--units", "mm") == 0
     scene, network, registrar = opened[0]
     assert scene.rest.names == registrar.model.rest.names and network is None and registrar.network is None
 
@@ -283,7 +282,7 @@ def test_a_mesh_without_volume_is_a_sentence(tmp_path: Path) -> None:
 
 
 def test_two_objects_in_a_cloud_are_warned_of(
-    angle: mereo.Object, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    angle: mereo.Object, points: ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mereo.api.reconstruct.answer_observation", None)  # which would search long
     both, sentence = np.concatenate([points, points + np.array([0.5, 0.0, 0.0])]), "two separate clusters of like size"
@@ -303,7 +302,7 @@ def test_a_wrong_unit_ends_a_command_with_a_sentence_and_nothing_written(
     unit_m: str,
     words: str,
     meshes: list[str],
-    points: np.ndarray,
+    points: ndarray,
     working_folder: Path,
     capsys: pytest.CaptureFixture,
 ) -> None:
@@ -315,7 +314,7 @@ def test_a_wrong_unit_ends_a_command_with_a_sentence_and_nothing_written(
     assert text.count("mereo: error: ") == 1 and words in text and set(Path().iterdir()) == before
 
 
-def test_a_network_cannot_answer_for_an_object_without(angle: mereo.Object, points: np.ndarray) -> None:
+def test_a_network_cannot_answer_for_an_object_without(angle: mereo.Object, points: ndarray) -> None:
     with pytest.raises(ValueError, match="the method is network, but the object has no weights"):
         mereo.reconstruct(points, angle, "network")
 
@@ -369,7 +368,7 @@ def angle_that(moves: str, folder: Path, path: Path) -> mereo.Object:
     return mereo.load_object(path)
 
 
-def view_of(bent: mereo.Object, number: int) -> tuple[np.ndarray, SegmentedMesh]:
+def view_of(bent: mereo.Object, number: int) -> tuple[ndarray, SegmentedMesh]:
     """View of the whole object in a random state, and that state, both in metres."""
     assert bent.scene is not None and bent.scene.unit_m is not None
     placed = bent.scene.sample_state(example_rng(1000, number)).mesh.transformed(FAR)
@@ -404,7 +403,7 @@ def test_a_rigid_object_is_placed_exactly_by_every_way(moves: str, folder: Path,
     rigid = angle_that(moves, folder, tmp_path / "angle.yaml")
     assert rigid.model is not None and rigid.model.count == 0
     points, true = view_of(rigid, 0)
-    methods: tuple[AnswerMethod, ...] = ("auto", "full") if moves == "rigid" else ("full",)
+    methods = ("auto", "full") if moves == "rigid" else ("full",)
     answers = [mereo.reconstruct(points, rigid, method, resolution=24, unit_m=1.0) for method in methods]
     answers.append(mereo.reconstruct(points, rigid, resolution=24, unit_m=1.0, initial_pose=answers[0].pose))
     tracker = mereo.Tracker(rigid)

@@ -3,13 +3,14 @@
 import json
 import pickle
 import re
+from math import pi
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import yaml
-from folder_contents import read_json
+from folder_contents import read_json, run_mereo
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from page_blocks import blocks
@@ -20,6 +21,7 @@ import mereo.__main__ as command_line
 from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import Range
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
@@ -118,11 +120,11 @@ def test_an_option_names_the_meshes_and_a_scene_file_keeps_it(
     working_folder: Path, capsys: pytest.CaptureFixture
 ) -> None:
     Path("laptop.urdf").write_text(LAPTOP.replace("</link>", BALL, 1))
-    command_line.main(["scene", "new", "laptop.urdf", "--robot-meshes", "collision"])
+    run_mereo("scene", "new", "laptop.urdf", "--robot-meshes", "collision")
     scene = mereo.load_object("laptop.urdf", robot_meshes="collision").scene
     assert_array_equal(load_scene("laptop.yaml").rest.merged()[0], scene.rest.merged()[0])
     assert np.ptp(scene.rest.bounds[:, 0]) * scene.unit_m == pytest.approx(0.8, abs=1e-3)
-    assert command_line.main(["scene", "new", "box.obj", "--robot-meshes", "collision"]) == 2
+    assert run_mereo("scene", "new", "box.obj", "--robot-meshes", "collision") == 2
     assert "--robot-meshes is collision, but box.obj is no robot's file: leave it out" in capsys.readouterr().err
 
 
@@ -214,7 +216,7 @@ def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     gripper: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     path = tmp_path / "gripper.yaml"
-    assert command_line.main(["scene", "new", str(gripper), "--output", str(path)]) in (0, None)
+    assert run_mereo("scene", "new", gripper, "--output", path) in (0, None)
     text = capsys.readouterr().out
     assert "deformations: by its joints, as the file says" in text and "links may" in text and "'spin'" in text
     scene = load_scene(path)
@@ -226,13 +228,13 @@ def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     palm, left, right = (deform(np.zeros((1, 3)))[0] * scene.unit_m for deform in motion(rng))
     assert 0.003 < -left[0] < 0.035 and right[0] == pytest.approx(-0.5 * left[0] + 0.002)
     assert_allclose([*palm, *left[1:], *right[1:]], 0.0, atol=1e-12)
-    assert command_line.main(["scene", "check", str(path)]) in (0, None)  # links that overlap are no fault
+    assert run_mereo("scene", "check", path) in (0, None)  # links that overlap are no fault
     assert "note: left and right overlap" in capsys.readouterr().out
 
 
 def test_joints_without_names_draw_as_before_and_names_are_checked(tmp_path: Path, gripper: Path) -> None:
     path = tmp_path / "gripper.yaml"
-    command_line.main(["scene", "new", str(gripper), "--output", str(path)])
+    run_mereo("scene", "new", gripper, "--output", path)
     text = path.read_text()
     for old, new, message in (
         ("name: other finger", "name: finger", "two joints are called 'finger'"),
@@ -336,7 +338,7 @@ def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
         assert facts[name]["interval"][0] < expected < facts[name]["interval"][1]
         value, (least, most) = facts[name]["value"], facts[name]["interval"]
         assert f"joint {name}: {JointValue(value, (least, most), 'm', (0.0, 1.0))}" in printed
-    variables: dict[str, object] = {}
+    variables = {}
     exec(compile(code, "own-object.md", "exec"), variables)
     result = variables["result"]
     assert isinstance(result, mereo.Result)
@@ -351,7 +353,7 @@ def test_each_frame_of_a_stream_has_the_joints_of_its_moment(
     Path("frames").mkdir()
     scene = scene_of_meshes([gripper])
     true = [write_frame(Path(f"frames/{i}.ply"), scene, 0.4 + 0.03 * i, 5) for i in range(6)]
-    command_line.main(["stream", "frames", "--object", str(gripper), "--unit-m", "1", "--every-frame"])
+    run_mereo("stream", "frames", "--object", gripper, "--unit-m", "1", "--every-frame")
     lines = [*map(json.loads, capsys.readouterr().out.splitlines())]
     assert [line["tracking"] for line in lines] == ["found", *["followed"] * 5]
     fingers = [[line["joints"][name]["value"] for line in lines] for name in ("finger", "other finger")]
@@ -366,7 +368,7 @@ def known(gripper: Path) -> mereo.Object:
     return mereo.load_object(gripper)
 
 
-def given_shares(known: mereo.Object, given: object) -> tuple[float, float]:
+def given_shares(known: mereo.Object, given: object) -> Range:
     """Shares of the range of the gripper's finger that are left, of which both fingers' random states are."""
     narrowed = known.with_joints(given)
     assert narrowed.scene is not None and known.scene is not None
@@ -408,14 +410,14 @@ def test_known_values_narrow_the_random_states_whoever_states_them(known: mereo.
 def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> None:
     (tmp_path / "laptop.urdf").write_text(LAPTOP.replace("revolute", "continuous"))
     laptop = mereo.load_object(tmp_path / "laptop.urdf")
-    for value in (3.1 - 2 * np.pi, 3.1 + 4 * np.pi):
+    for value in (3.1 - 2 * pi, 3.1 + 4 * pi):
         scene = laptop.with_joints({"hinge": {"value": value, "within": 0.1}}).scene
         assert scene is not None and isinstance(scene.sample_deformations, RandomMotion)
         shares = np.array(scene.sample_deformations.joints["hinge"][0].shares)
-        assert_allclose((2 * np.pi * shares - np.pi) % (2 * np.pi), [3.0, 3.2], atol=1e-9)
+        assert_allclose((2 * pi * shares - pi) % (2 * pi), [3.0, 3.2], atol=1e-9)
 
 
-NO_JOINTS: dict[str, object] = {
+NO_JOINTS = {
     "no joint is called 'fingr'; it must be one of other finger, finger: correct it": {"fingr": 0.02},
     "joint 'finger' is 0.05; its limits are 0.003 to 0.035 m: correct it, or add `within`": {"finger": 0.05},
     "joint 'finger' is 'open'; it must be a finite number: give for example 0.1": {"finger": "open"},
@@ -469,7 +471,7 @@ def test_objects_without_named_joints_and_files_of_other_things_are_refused(
         ("bad joint.yaml", "bad joint.yaml: joint 'finger' is 1; its limits are 0.003 to 0.035 m"),
     ):
         for command in (["reconstruct", "frames/frame.ply", "--output", "result"], ["stream", "frames"]):
-            assert command_line.main([*command, "--object", str(gripper), "--joints", name]) == 2
+            assert run_mereo(*command, "--object", gripper, "--joints", name) == 2
             assert sentence in capsys.readouterr().err
     assert not Path("result").exists()
 
@@ -491,7 +493,7 @@ def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
     assert_allclose(fixed["left"].mesh.vertices, free["left"].mesh.vertices, atol=3e-4)
     Path("joints.yaml").write_text(f"finger: {{value: {true + 0.002}, within: 0.003}}\n")
     options = ["--object", str(gripper), "--unit-m", "1", "--joints", "joints.yaml"]
-    command_line.main(["reconstruct", "frame.ply", *options, "--output", "result"])
+    run_mereo("reconstruct", "frame.ply", *options, "--output", "result")
     assert "joint finger: " in capsys.readouterr().out
     facts = read_json(Path("result/summary.json"))["joints"]["finger"]
     assert true - 0.001 <= facts["interval"][0] <= true <= facts["interval"][1] <= true + 0.005

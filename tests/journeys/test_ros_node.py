@@ -12,6 +12,7 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import yaml
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
 from robot_files import write_gripper
 from rosbags.typesys import Stores, get_typestore
@@ -21,6 +22,7 @@ import mereo
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.robots import read_robot
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
@@ -62,7 +64,7 @@ def message(name: str) -> Any:
 class Node:
     """What of ``rclpy.node.Node`` is used; ``stated`` are the parameters that a launch file gives."""
 
-    stated: ClassVar[dict[str, Any]] = {}
+    stated: ClassVar[JsonObject] = {}
     destroy_node = create_timer = MagicMock()
 
     def __init__(self, name: str) -> None:
@@ -122,9 +124,9 @@ def image(depth: np.ndarray, time_s: float, encoding: str = "32FC1") -> Any:
 # --- the node ---------------------------------------------------------------------------------------------------------
 
 
-def taken(node: Any) -> dict[str, Any]:
+def taken(node: Any) -> JsonObject:
     """Messages that were sent since the last call, by their types; transforms as poses in the camera's frame."""
-    sent: dict[str, Any] = {FRAME: np.eye(4)}
+    sent = {FRAME: np.eye(4)}
     for each in node.sent:
         if isinstance(each, message("geometry_msgs/msg/TransformStamped")):
             step, turn = (list(vars(value).values()) for value in vars(each.transform).values())  # as they are defined
@@ -145,7 +147,7 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     parts = zip(read_robot(robot).mesh.segments, (0.0, -0.02, 0.012), strict=True)  # the fingers are so far open
     moved = [SegmentedMesh((part,)).transformed(T @ rigid(np.eye(3), np.array([x, 0, 0]))) for part, x in parts]
     mesh = SegmentedMesh(tuple(each.segments[0] for each in moved))
-    depth = add_depth_noise(render_depth(mesh, CAMERA), 2e-4, np.random.default_rng(0)).depth
+    depth = add_depth_noise(render_depth(mesh, CAMERA), 2e-4, default_rng(0)).depth
     node, frame = ros.ObjectTracker(), image(depth, 5.5)
     node._keep_info(INFO)
     node.answer(frame)

@@ -10,12 +10,14 @@ import numpy as np
 import pytest
 import trimesh
 from folder_contents import read_json
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from page_blocks import ROOT, blocks
 
 import mereo
 from mereo import __main__ as command_line
+from mereo.geometry.conventions import Range
 from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.io.mesh_formats import read_segmented_mesh
 from mereo.io.writers.meshes import write_positions_ply
@@ -32,15 +34,15 @@ PAGE = (ROOT / "docs/own-object.md").read_text().partition("### From a simulatio
 class Simulator:
     """An angle 120 mm long whose arm bends and whose end twists, by other amounts at each step."""
 
-    rest: np.ndarray
+    rest: ndarray
     rng: Generator
-    amounts: tuple[float, float] = (0.0, 0.0)
+    amounts: Range = (0.0, 0.0)
 
     def step(self) -> None:
         bend, twist = self.rng.uniform(-1, 1, 2)
         self.amounts = (float(bend), float(twist))
 
-    def positions(self) -> np.ndarray:
+    def positions(self) -> ndarray:
         x, y, z = self.rest.T
         bend, twist = self.amounts
         angle = 0.5 * twist * x / 120
@@ -58,7 +60,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     x, y, _ = solid.cell_centers().points.T
     solid = solid.extract_cells((x < 40) | (y < 36))
     solid.save(found / "volume.vtk")
-    simulator = Simulator(np.array(solid.points, dtype=float), default_rng(0))
+    simulator = Simulator(np.array(solid.points, float), default_rng(0))
     (code,) = (code for code in blocks(ROOT / "docs/own-object.md", "python") if "simulator.step()" in code)
     (text,) = (text for text in blocks(ROOT / "docs/own-object.md", "yaml") if text.startswith("name: organ"))
     (found / "organ.yaml").write_text(text, encoding="utf-8")

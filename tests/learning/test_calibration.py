@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 import torch
 from analytic import untrained
+from folder_contents import run_mereo
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from safetensors.torch import load_file
 
-from mereo import __main__ as command_line
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.radii import Radii, rounded_to
 from mereo.models.calibration import Calibration, RadiusFactors
@@ -35,7 +35,7 @@ def test_the_error_is_the_distance_of_confidence_from_right_answers() -> None:
     counted = Reliability()
     counted.add(np.full(10, 0.6), np.arange(10) > 0)
     assert counted.ece == pytest.approx(0.3)
-    counted.add(np.full(10, 1.0), np.ones(10, dtype=bool))
+    counted.add(np.full(10, 1.0), np.ones(10, bool))
     assert counted.ece == pytest.approx(0.15)
     assert [bin["share"] for bin in counted.facts()] == [0.5, 0.5] and counted.bins.shape == (3, BINS)
     assert np.isnan(Reliability().ece)
@@ -62,7 +62,7 @@ def test_labels_stay_and_probabilities_are_scaled() -> None:
     points = default_rng(2).normal(size=(300, 3)) + np.array([0.0, 0.0, 5.0])
     before, after = (model.query(model.encode(points), points) for model in (plain, scaled))
     assert_array_equal(before.label, after.label)
-    logits = plain.logits(plain.encode(points), points).astype(np.float64)
+    logits = plain.logits(plain.encode(points), points).astype(float)
     expected = np.exp(logits / 2.0 + [0.0, -1.0, 0.5])
     assert_allclose(after.probability, expected / expected.sum(axis=1, keepdims=True), atol=1e-5)
     assert scaled.calibrates and not plain.calibrates
@@ -71,12 +71,12 @@ def test_labels_stay_and_probabilities_are_scaled() -> None:
 
 
 def test_observed_points_have_the_calibrated_probability_of_their_own_segment() -> None:
-    logits = np.log(np.array([[0.5, 0.4, 0.1], [0.2, 0.3, 0.5]], dtype=np.float32))
+    logits = np.log(np.array([[0.5, 0.4, 0.1], [0.2, 0.3, 0.5]], np.float32))
     of_segments = partial(segment_points, logits, np.zeros((2, 3)), NAMES, ((0, 0, 0), (9, 9, 9)))
     halved = of_segments(Calibration(seed=0, views=8, temperature=0.5))
     assert_array_equal(of_segments().labels, halved.labels)
     assert_allclose(halved.confidence, [16 / 17, 25 / 34], rtol=1e-5)
-    given = of_segments(labels=np.array([2, 2], dtype=np.uint8))
+    given = of_segments(labels=np.array([2, 2], np.uint8))
     assert_allclose(given.confidence, [0.2, 5 / 8], rtol=1e-5)
 
 
@@ -97,15 +97,15 @@ def test_the_command_writes_what_was_measured_beside_the_weights(tmp_path: Path,
     path, output = tmp_path / "plain.safetensors", tmp_path / "calibrated.safetensors"
     save_model(untrained(load_scene("rope").rest.names), path)
     before = path.read_bytes()
-    assert command_line.main(["calibrate", str(path)]) == 2
+    assert run_mereo("calibrate", path) == 2
     assert "exists; it is not overwritten" in capsys.readouterr().err and path.read_bytes() == before
-    assert command_line.main(["calibrate", str(path), "--output", str(output), "--views", "8"]) == 0
+    assert run_mereo("calibrate", path, "--output", output, "--views", "8") == 0
     told = capsys.readouterr().out
     assert "8 views of the training seed 900000" in told and f"wrote {output}" in told
     found = load_model(output).calibration
     assert found is not None and found.temperature is not None and found.recognizing is None
     assert found.ece is not None and found.ece[1] < min(0.05, found.ece[0])
-    assert command_line.main(["weights", "show", str(output), "--json"]) == 0
+    assert run_mereo("weights", "show", output, "--json") == 0
     assert json.loads(capsys.readouterr().out)["calibration"]["views"] == 8
 
 
@@ -118,13 +118,13 @@ def test_test_seeds_and_too_few_views_are_refused() -> None:
 
 
 def test_radii_between_points_are_between_theirs_and_their_scale_ends_at_all_but_a_twentieth() -> None:
-    labels = np.repeat(np.array([1, 2, 1], dtype=np.uint8), 10)
+    labels = np.repeat(np.array([1, 2, 1], np.uint8), 10)
     radii = Radii(default_rng(0).random((30, 3)), labels, np.linspace(1, 2, 30), (10, 10), False)
     assert_allclose(radii.at(radii.points[:10], 1), radii.values[:10])
     between = radii.at(np.full((1, 3), 0.5), 2)
     assert radii.values[10:20].min() <= between[0] <= radii.values[10:20].max()
     assert [len(part) for part in radii.vertices] == [10, 10]
-    grid = LabelGrid(np.array([[[0, 1, 2]]], dtype=np.uint8), np.zeros(3), np.full(3, 0.4), ("a", "b"))
+    grid = LabelGrid(np.array([[[0, 1, 2]]], np.uint8), np.zeros(3), np.full(3, 0.4), ("a", "b"))
     on_grid = radii.on_grid(grid)[0, 0]
     assert np.isnan(on_grid[0]) and 1 <= on_grid[1] <= 2 and 1.3 < on_grid[2] < 1.7
     scaled = radii.scaled(1000.0)

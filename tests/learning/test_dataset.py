@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import torch
 from folder_contents import read_json
+from numpy.random import Generator
 from safetensors.torch import load_file
 from small_training import SMALL
+from torch import Tensor
 from toy_data import half_balls, read_all, write_toy_dataset
 
 from mereo.models.weights import load_model
@@ -31,12 +33,14 @@ from mereo_learning.validation import choose_offsets, held_out, validate
 
 pytestmark = pytest.mark.usefixtures("without_curves")
 
+Datasets = tuple[Dataset, Dataset]
+
 NONE = AugmentConfig()
 FULL = AugmentConfig(keep_points=(0.4, 0.9), hole_probability=1.0, jitter_std=0.01, roll=True)
 
 
 @pytest.fixture(scope="module")
-def data(pair: tuple[Dataset, Dataset]) -> Dataset:
+def data(pair: Datasets) -> Dataset:
     return pair[0]
 
 
@@ -51,13 +55,13 @@ def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> 
     assert visible_m == (pytest.approx(0.1, rel=0.1), pytest.approx(0.2, rel=0.1))
 
 
-def observed(generator: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+def observed(generator: Generator, points: int, queries: int) -> dict[str, np.ndarray]:
     """Half balls, and three halves of their cloud, of which the last has fewer points."""
     row = half_balls(generator, points, queries)
     cloud, half = row["cloud"], points // 2
     parts = [cloud[:half], cloud[-half:], cloud[10:40]]
     seen = np.stack([part[np.arange(points) % len(part)] for part in parts]).astype(np.float16)
-    return row | {"seen": seen, "seen_count": np.array([len(part) for part in parts], dtype=np.int32)}
+    return row | {"seen": seen, "seen_count": np.array([len(part) for part in parts], np.int32)}
 
 
 def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
@@ -112,7 +116,7 @@ def test_roll_is_a_rigid_motion_about_the_optical_axis(data: Dataset) -> None:
     plain = data.batch(torch.arange(6), 96, 0, NONE, Draws.of(0))
     rolled = augment_batch(plain, AugmentConfig(roll=True), Draws.of(1))
 
-    def gaps(batch: Batch) -> torch.Tensor:
+    def gaps(batch: Batch) -> Tensor:
         everything = torch.cat([batch.positions[:, :20], batch.cloud[:, :20], batch.viewpoint[:, None]], dim=1).double()
         distances = torch.cdist(everything, everything)
         return distances / distances.amax(dim=(1, 2), keepdim=True)
@@ -166,16 +170,16 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture(scope="module")
-def pair(folders: tuple[Path, Path]) -> tuple[Dataset, Dataset]:
+def pair(folders: tuple[Path, Path]) -> Datasets:
     return Dataset.load(folders[0]), Dataset.load(folders[1])
 
 
-def batch_of(data: Dataset, probability: float, observation: torch.Tensor | None = None, seed: int = 0) -> Batch:
+def batch_of(data: Dataset, probability: float, observation: Tensor | None = None, seed: int = 0) -> Batch:
     augment = AugmentConfig(observations=probability, keep_points=(0.7, 1.0), jitter_std=0.003)
     return data.batch(torch.arange(8), 48, 32, augment, Draws.of(seed), observation)
 
 
-def test_a_batch_depends_on_its_generator_and_at_probability_0_on_no_further_one(pair: tuple[Dataset, Dataset]) -> None:
+def test_a_batch_depends_on_its_generator_and_at_probability_0_on_no_further_one(pair: Datasets) -> None:
     plain, seen = pair
     assert (plain.further, seen.further) == (0, KINDS)
     same = [(batch_of(seen, 0.0, seed=seed), batch_of(plain, 0.5, seed=seed)) for seed in range(3)]
@@ -194,7 +198,7 @@ def test_further_ones_are_seen_as_often_as_asked_and_by_default_in_half_of_the_d
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
-def test_queries_and_cloud_stay_in_one_frame(pair: tuple[Dataset, Dataset], number: int) -> None:
+def test_queries_and_cloud_stay_in_one_frame(pair: Datasets, number: int) -> None:
     """The box is normalized anew, so distances between queries, cloud and camera keep their ratios to the stored."""
     seen = read_all(pair[1])
     found = pair[1].batch(torch.arange(8), 96, 0, AugmentConfig(), Draws.of(0), FIRST + number)
@@ -228,7 +232,7 @@ def test_a_run_scores_sensors_apart_and_says_what_it_saw(folders: tuple[Path, Pa
     assert models[1].provenance["recipe"]["augment"]["observations"] == 0.5  # type: ignore[index]
 
 
-def test_held_out_scores_and_offsets_are_of_the_first_cloud(pair: tuple[Dataset, Dataset]) -> None:
+def test_held_out_scores_and_offsets_are_of_the_first_cloud(pair: Datasets) -> None:
     plain, seen = pair
     config = fit_config(replace(SMALL, offset_examples=8), seen)
     network = trainer.start_network(config, seen)
@@ -241,7 +245,7 @@ def test_held_out_scores_and_offsets_are_of_the_first_cloud(pair: tuple[Dataset,
     assert validate(network, seen, config, further=True).iou != validate(network, seen, config).iou
 
 
-def test_an_autodecoder_sees_every_example_as_it_is(pair: tuple[Dataset, Dataset]) -> None:
+def test_an_autodecoder_sees_every_example_as_it_is(pair: Datasets) -> None:
     """Its codes are of examples, not of clouds."""
     for preset, data, share in (("paper-autodecoder", pair[1], 0.0), ("paper", pair[1], 0.5), ("paper", pair[0], 0.0)):
         assert fit_config(PRESETS[preset], data).augment.observations == share

@@ -71,7 +71,7 @@ def test_truth_grid_against_point_by_point() -> None:
     index = np.indices((16, 16, 16)).reshape(3, -1).T
     points = low + (index + 0.5) / 16 * (high - low)
     assert_allclose(truth.grid.positions(index), points)
-    kept = np.zeros(len(points), dtype=bool)
+    kept = np.zeros(len(points), bool)
     for segment in mesh.segments:
         center, size = segment.bounds.mean(axis=0), np.ptp(segment.bounds, axis=0)
         kept |= (np.abs(points - center) <= 0.75 * size).all(axis=1)

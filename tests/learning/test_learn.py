@@ -5,7 +5,6 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 from unittest.mock import Mock
 
 import numpy as np
@@ -25,6 +24,7 @@ from mereo.cli.answers import StreamCommand
 from mereo.cli.options import loaded_object
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.geometry.transforms import rigid, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.weights import load_model
@@ -259,7 +259,7 @@ def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path
 
 GOOD = {"examples": 16, "iou": 0.96, "miou_up_to_symmetry": 0.92, "lowest_miou": 0.8, "explained": 1.0, "seconds": 1.5}
 
-ROWS: dict[str, dict[str, Any]] = {
+ROWS = {
     "search": {"iou": 0.96, "miou_up_to_symmetry": 0.90, "explained": 1.0, "seconds": 1.5},
     "network": {"iou": 0.80, "miou_up_to_symmetry": 0.70, "seconds": 0.5},
     "both": {"iou": 0.96, "miou_up_to_symmetry": 0.905, "explained": 1.0, "seconds": 0.8},
@@ -302,7 +302,7 @@ def test_the_search_is_good_enough_by_stated_numbers(changed: dict[str, float], 
         ({name: {"miou_up_to_symmetry": None} for name in ROWS}, "auto", "as good as the search alone"),
     ],
 )
-def test_the_best_answer_is_the_fastest_of_equals(changed: dict[str, dict[str, Any]], method: str, reason: str) -> None:
+def test_the_best_answer_is_the_fastest_of_equals(changed: dict[str, JsonObject], method: str, reason: str) -> None:
     best, sentence = best_method({name: {**row, **changed.get(name, {})} for name, row in ROWS.items()})
     titles = {"auto": "both", "search": "the search alone", "network": "the network alone"}
     assert best == method and sentence.startswith(f"use {titles[method]}: {reason}")
@@ -329,9 +329,9 @@ def test_segments_that_no_frame_tells_apart_are_right_either_way() -> None:
 def test_time_ends_the_views_but_not_before_the_least_and_begun_ones_are_kept(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    made: list[int] = []
+    made = []
 
-    def scored(scene: object, registrar: object, cells: int, index: int) -> dict[str, Any]:
+    def scored(scene: object, registrar: object, cells: int, index: int) -> JsonObject:
         made.append(index)
         return {"confusion": np.eye(9, dtype=int).tolist(), "explained": True, "seconds": 0.1}
 

@@ -17,9 +17,10 @@ import pytest
 import torch
 import torch.distributed as dist
 from safetensors.torch import load_file
-from torch import nn
+from torch import Tensor, nn
 from toy_data import write_toy_dataset
 
+from mereo.geometry.conventions import Triple
 from mereo_learning.processes import Process, SharedBatchNorm, share_statistics
 
 TRAIN = (
@@ -75,7 +76,7 @@ def train(folder: Path, output: str, options: str, nodes: int = 0, **more: str) 
     return said
 
 
-def differences(folder: Path, one: str, other: str) -> tuple[float, float, float]:
+def differences(folder: Path, one: str, other: str) -> Triple:
     """How far two runs are apart: the first loss and the worst, each relative, and weights and their statistics."""
     tables = []
     for name in (one, other):
@@ -155,7 +156,7 @@ def group(tmp_path: Path) -> Iterator[None]:
     dist.destroy_process_group()
 
 
-def learnt(norm: nn.Module, rows: torch.Tensor, gradient: torch.Tensor) -> list[torch.Tensor]:
+def learnt(norm: nn.Module, rows: Tensor, gradient: Tensor) -> list[Tensor]:
     """Outputs, all gradients, and running statistics of a step."""
     rows = rows.clone().requires_grad_()
     out = norm(rows)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from analytic import AnalyticModel, oracle
 from folder_contents import read_json
+from numpy import ndarray
 from numpy.linalg import det, inv, norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -19,6 +20,7 @@ from shapes import ball, box
 
 from mereo.__main__ import main
 from mereo.geometry.camera import VIEW_DISTANCE, Camera, into_camera
+from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import Normalizer, inverse_rigid, rigid, transform_points, unit_rows
@@ -43,7 +45,7 @@ from mereo_learning.scoring import EvaluationConfig, evaluate
 from mereo_objects.bunny import model_to_scene
 
 CAMERA, NOISE = Camera.from_fov(160, 160, float(np.deg2rad(30.0))), 0.02
-Bar, Require = tuple[Path, Scene, np.ndarray], Callable[[str], Path]
+Bar, Require = tuple[Path, Scene, ndarray], Callable[[str], Path]
 
 
 def object_at_rest() -> SegmentedMesh:
@@ -52,7 +54,7 @@ def object_at_rest() -> SegmentedMesh:
     return SegmentedMesh((base, arm, box((8, 5, 8.5), (12, 8, 11), "peg", 2)))
 
 
-def true_poses() -> np.ndarray:
+def true_poses() -> ndarray:
     """In a camera frame: three sides of base and arm are seen; the arm is bent away by 25 degrees."""
     turn = Rotation.from_euler("yx", [-35, 25], degrees=True).as_matrix()
     whole = rigid(turn, np.array([-8.0, -2.0, 110.0]))
@@ -60,13 +62,13 @@ def true_poses() -> np.ndarray:
     return np.stack([whole, whole @ rigid(bend, joint - bend @ joint), whole])
 
 
-def scan_of(mesh: SegmentedMesh, noise: float, seed: int = 0) -> np.ndarray:
+def scan_of(mesh: SegmentedMesh, noise: float, seed: int = 0) -> ndarray:
     """What ``CAMERA`` sees of a mesh in its frame, noise in the mesh's unit."""
     points = render_depth(mesh, CAMERA).to_points().points
     return points + default_rng(seed).normal(scale=noise, size=points.shape)
 
 
-def perturbed(pose: np.ndarray, middle: np.ndarray, degrees: float, shift: float, seed: int) -> np.ndarray:
+def perturbed(pose: ndarray, middle: ndarray, degrees: float, shift: float, seed: int) -> ndarray:
     """``pose``, then a turn about ``middle`` (model coordinates) and a shift, both in a random direction."""
     rng = default_rng(seed)
     axis, way = (vector / norm(vector) for vector in rng.normal(size=(2, 3)))
@@ -74,7 +76,7 @@ def perturbed(pose: np.ndarray, middle: np.ndarray, degrees: float, shift: float
     return rigid(turn, place - turn @ place + shift * way) @ pose
 
 
-def pose_error(found: np.ndarray, true: np.ndarray, middle: np.ndarray) -> tuple[float, float]:
+def pose_error(found: ndarray, true: ndarray, middle: ndarray) -> Range:
     """Distance of the segment's middle from where it belongs, and the turn in degrees."""
     shift = norm(transform_points(found, middle) - transform_points(true, middle))
     turn = Rotation.from_matrix((found @ inv(true))[:3, :3])
@@ -84,7 +86,7 @@ def pose_error(found: np.ndarray, true: np.ndarray, middle: np.ndarray) -> tuple
 pytest.importorskip("small_gicp", reason="the extra align is not installed")
 
 
-def middles() -> list[np.ndarray]:
+def middles() -> list[ndarray]:
     return [segment.bounds.mean(axis=0) for segment in object_at_rest().segments]
 
 
@@ -98,12 +100,12 @@ def start() -> Start:
 
 
 @pytest.fixture(scope="module")
-def points() -> np.ndarray:
+def points() -> ndarray:
     return scan_of(moved(object_at_rest(), true_poses()), NOISE)
 
 
 @pytest.fixture(scope="module")
-def placement(points: np.ndarray) -> Placement:
+def placement(points: ndarray) -> Placement:
     return place(object_at_rest(), points, start())
 
 
@@ -126,7 +128,7 @@ def test_each_segment_comes_to_its_own_true_pose_and_a_hidden_one_goes_with_its_
 
 
 @pytest.mark.slow
-def test_a_held_segment_is_left_to_its_neighbour_or_start(points: np.ndarray) -> None:
+def test_a_held_segment_is_left_to_its_neighbour_or_start(points: ndarray) -> None:
     rest, rough = object_at_rest(), start()
     own = place(rest, points, rough, hold=["arm"]).segments[1]
     assert own.placed_by == "start"
@@ -136,7 +138,7 @@ def test_a_held_segment_is_left_to_its_neighbour_or_start(points: np.ndarray) ->
 
 
 @pytest.mark.slow
-def test_as_one_moves_all_by_one_motion(points: np.ndarray) -> None:
+def test_as_one_moves_all_by_one_motion(points: ndarray) -> None:
     """What is rigid keeps its shape, whatever the scan says of its parts."""
     rest = SegmentedMesh((object_at_rest().segments[0], object_at_rest().segments[2]))
     mine = scan_of(moved(rest, true_poses()[[0, 2]]), NOISE)
@@ -147,7 +149,7 @@ def test_as_one_moves_all_by_one_motion(points: np.ndarray) -> None:
     assert pose_error(base.T_scan_segment, true_poses()[0], middles()[0])[0] < 0.05
 
 
-def test_a_scan_of_something_else_or_far_from_the_start_is_refused(points: np.ndarray) -> None:
+def test_a_scan_of_something_else_or_far_from_the_start_is_refused(points: ndarray) -> None:
     """Three points in five belong to a wall behind the object."""
     few = points[::4]
     wall = default_rng(0).uniform([-60, -60, 170], [60, 60, 171], size=(len(few) * 3 // 2, 3))
@@ -203,7 +205,7 @@ POSE = rigid(SCALE * TURN, np.array([1.0, 2.0, 3.0]))
 MODEL = np.array([[0.0, 0, 0], [20, 0, 0], [0, 12, 0], [30, 5, 8]])
 
 
-def pairs(model: np.ndarray = MODEL, pose: np.ndarray = POSE) -> dict[str, list[list[float]]]:
+def pairs(model: ndarray = MODEL, pose: ndarray = POSE) -> dict[str, list[list[float]]]:
     return {"model": model.tolist(), "scan": transform_points(pose, model).tolist()}
 
 
@@ -402,7 +404,7 @@ TOLERANCE = {"body": (0.25, 0.4), "tail": (0.7, 2.0)} | dict.fromkeys(("head", "
 """Millimetres at the segment's middle, and degrees, from the published pose; the scan lies 0.1 mm from the model."""
 
 
-def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, np.ndarray, float]:
+def bunny_truth_pose(name: str) -> tuple[SegmentedMesh, ndarray, float]:
     """The bunny at rest, its published pose in a scan, and metres per scene unit."""
     middle, units_per_m = model_to_scene()
     T_model_scene = rigid(np.eye(3) / units_per_m, middle)

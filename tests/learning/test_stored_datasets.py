@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-from collections.abc import Callable
 from itertools import count
 from pathlib import Path
 
@@ -25,6 +24,8 @@ __all__ = ["small_shards"]  # a fixture
 TOY = toy_scene()
 NUMBERS = count()
 
+Folders = tuple[Path, Path]
+
 
 def make(output: Place, seed: int = 3, **options: object) -> Place:
     generate(TOY, output, SMALL, examples=4, seed=seed, **options)  # type: ignore[arg-type]
@@ -32,7 +33,7 @@ def make(output: Place, seed: int = 3, **options: object) -> Place:
 
 
 @pytest.fixture(scope="module")
-def originals(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def originals(tmp_path_factory: pytest.TempPathFactory) -> Folders:
     """Two datasets of the same scene with other seeds, each of four examples in two shards."""
     with pytest.MonkeyPatch.context() as patch:
         make_small_datasets(patch)
@@ -42,7 +43,7 @@ def originals(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.fixture
-def whole(originals: tuple[Path, Path]) -> Path:
+def whole(originals: Folders) -> Path:
     return originals[0]
 
 
@@ -112,7 +113,7 @@ def test_a_lost_network_is_no_damage(whole: Path, stored: Place, monkeypatch: py
 # --- changed files ----------------------------------------------------------------------------------------------------
 
 
-DAMAGE: dict[str, Callable[[bytes, bytes], bytes]] = {
+DAMAGE = {
     "its checksum is another": lambda content, _: content[:-100] + bytes([content[-100] ^ 1]) + content[-99:],
     "it is of another dataset": lambda _, other: other,
     "": lambda content, _: content[:200],
@@ -122,7 +123,7 @@ DAMAGE: dict[str, Callable[[bytes, bytes], bytes]] = {
 @pytest.mark.parametrize("name", ["shard-00001.safetensors", "template.safetensors", "statistical_model.safetensors"])
 @pytest.mark.parametrize("reason", DAMAGE)
 def test_a_damaged_file_is_named_and_made_again(
-    stored: Place, originals: tuple[Path, Path], name: str, reason: str, capsys: pytest.CaptureFixture
+    stored: Place, originals: Folders, name: str, reason: str, capsys: pytest.CaptureFixture
 ) -> None:
     write_whole(stored / name, DAMAGE[reason](*((folder / name).read_bytes() for folder in originals)))
     with pytest.raises(ValueError, match=rf"{name} .*\({reason}.*\); delete it and run .?mereo generate"):

@@ -17,11 +17,13 @@ from numpy.random import default_rng
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from small_training import SMALL, TRANSFORMER
+from torch import Tensor
 from toy_data import NAMES, write_toy_dataset
 from training_runs import diverge_at, kill_after
 from two_balls import front
 
 from mereo import __main__ as command_line
+from mereo.geometry.conventions import Texts
 from mereo.geometry.metrics import confusion_matrix, intersection_over_union
 from mereo.models.weights import load_model
 from mereo_learning import metrics_log, trainer
@@ -42,7 +44,7 @@ def _quick_curves() -> Iterator[None]:
         yield
 
 
-def last_row(run: Path) -> dict[str, str]:
+def last_row(run: Path) -> Texts:
     with (run / "metrics.csv").open() as file:
         return list(csv.DictReader(file))[-1]
 
@@ -197,7 +199,7 @@ def test_a_chain_of_trainings_adds_up_and_only_a_learned_box_limits_it(dataset: 
     assert "which do not say how many" in describe_seen(old)
 
 
-def noisy_world(count: int, share: tuple[float, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor]:
+def noisy_world(count: int, share: tuple[float, ...], seed: int) -> tuple[Tensor, Tensor]:
     """Labels drawn with ``share``, a noisy observation of each, and the log likelihood of every class given it."""
     rng = default_rng(seed)
     labels = rng.choice(len(share), size=count, p=share)
@@ -206,7 +208,7 @@ def noisy_world(count: int, share: tuple[float, ...], seed: int) -> tuple[torch.
     return torch.from_numpy(logits).float(), torch.from_numpy(labels)
 
 
-def miou(logits: torch.Tensor, labels: torch.Tensor) -> float:
+def miou(logits: Tensor, labels: Tensor) -> float:
     return intersection_over_union(confusion_matrix(labels.numpy(), logits.argmax(1).numpy(), logits.shape[1])).miou
 
 

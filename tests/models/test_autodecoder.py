@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 import torch
 from answers import reconstruct
+from numpy import ndarray
 from numpy.linalg import norm
+from numpy.random import Generator
 from safetensors.torch import load_file
 from shapes import ball
 from toy_data import example_of, read_all, write_toy_dataset
@@ -46,7 +48,7 @@ SMALL = TrainConfig(
 )
 
 
-def ball_pair(rng: np.random.Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+def ball_pair(rng: Generator, points: int, queries: int) -> dict[str, ndarray]:
     """Two touching balls seen from the front, the second of 0.3 to 1 times the radius of the first."""
     radii = np.array([1.0, rng.uniform(0.3, 1.0)])
     centers = np.array([[0.0, 0.0, 20.0], [radii.sum(), 0.0, 20.0]])
@@ -87,7 +89,7 @@ def data(dataset: Path) -> Dataset:
     return Dataset.load(dataset)
 
 
-def seen(dataset: Path, number: int) -> np.ndarray:
+def seen(dataset: Path, number: int) -> ndarray:
     shard = load_file(dataset / "shard-00000.safetensors")
     return (shard["cloud"][number] / shard["scale"][number] + shard["center"][number]).double().numpy()
 

@@ -11,14 +11,15 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from folder_contents import run_mereo
 from numpy.random import default_rng
+from torch import Tensor
 from torch.nn import functional as F
 
-from mereo import __main__ as command_line
 from mereo.models import device
 from mereo.models.config import EXACT, InferenceConfig, Precision
 from mereo.models.device import ROWS, bfloat16_pays, find_device, in_threads, linear, onednn_pays, pick_precision
-from mereo.models.model import CPU_QUERY_CHUNK, Model
+from mereo.models.model import CPU_QUERY_CHUNK
 from mereo.models.weights import load_for, load_model
 from mereo.synthesis.sample_views import load_view
 from mereo_experiments.speed.stages import count_operations, random_points
@@ -79,7 +80,7 @@ def test_bfloat16_changes_few_labels_and_little_distance(tmp_path: Path) -> None
 def test_cuda_where_there_is_none_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert find_device("auto") == find_device("cpu") == torch.device("cpu")
     arguments = ["reconstruct", str(cloud_file(tmp_path)), "--weights", "bunny", "--output", str(tmp_path / "out")]
-    assert command_line.main([*arguments, "--device", "cuda"]) != 0
+    assert run_mereo(*arguments, "--device", "cuda") != 0
     assert "torch sees no CUDA device; leave out --device" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -92,12 +93,12 @@ def by_onednn(monkeypatch: pytest.MonkeyPatch) -> Mock:
     return device._by_onednn
 
 
-def layer(inputs: int = 70, outputs: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
+def layer(inputs: int = 70, outputs: int = 40) -> tuple[Tensor, Tensor]:
     numbers = torch.Generator().manual_seed(0)
     return torch.randn(outputs, inputs, generator=numbers), torch.randn(outputs, generator=numbers)
 
 
-def rows(count: int, inputs: int = 70) -> torch.Tensor:
+def rows(count: int, inputs: int = 70) -> Tensor:
     return torch.randn(1, count, inputs, generator=torch.Generator().manual_seed(1))
 
 
@@ -199,7 +200,7 @@ def test_a_forked_process_has_threads_of_its_own_and_computes() -> None:
 @pytest.mark.parametrize("name", ["bunny", "rope"])
 def test_cuda_answers_as_the_cpu(name: str) -> None:
     exact, view = load_model(name), load_view(name)
-    fast: Model = replace(load_model(name, "cuda"), precision="float32")
+    fast = replace(load_model(name, "cuda"), precision="float32")
     points, cloud = random_points(view, 900), view.depth.to_points()
     expected, answer = (model.query(model.encode(cloud), points) for model in (exact, fast))
     assert (answer.label != expected.label).mean() < 0.01

@@ -6,17 +6,19 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from folder_contents import read_json
+from numpy import ndarray
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
+from torch import Tensor
 
 from mereo.geometry.downsampling import farthest_point_order
 from mereo.geometry.mesh import PALETTE
+from mereo.io.atomic_files import JsonObject
 from mereo.models.config import NetworkConfig
 from mereo.models.export.mereo_onnx import main, prepare
 from mereo.models.export.onnx_export import ANSWERS, RUNNER, code_tensors, export_weights
@@ -37,7 +39,7 @@ SMALL = NetworkConfig().changed(
 )
 """The paper's structure in small: no alignment, no local features, no template."""
 
-CASES: dict[str, tuple[NetworkConfig, str]] = {
+CASES = {
     "plain": (SMALL.changed(sight_neighbors=4), "l1"),
     "everything": (TINY, "ce+l1+cd"),
     "transformer": (
@@ -70,7 +72,7 @@ def model_of(config: NetworkConfig, loss: str) -> Model:
     )
 
 
-def seen(count: int, seed: int) -> np.ndarray:
+def seen(count: int, seed: int) -> ndarray:
     """Normalized points on a bent surface, in random order, float32."""
     u, v = default_rng(seed).uniform(-1, 1, (2, count))
     return np.stack([u, 0.7 * v, 0.4 * np.sin(2 * u) + 0.3 * v * v], axis=1).astype(np.float32)
@@ -79,7 +81,7 @@ def seen(count: int, seed: int) -> np.ndarray:
 SHIPPED = "bunny"
 
 
-def inputs_of(model: Model) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
+def inputs_of(model: Model) -> Iterator[tuple[Tensor, Tensor]]:
     """Clouds in the order of the model, and points to query: one, then more of both than the model's own number."""
     for extra, queries in ((0, 1), (31, 100)):
         points = seen(model.network.config.points + extra, 5)
@@ -87,13 +89,13 @@ def inputs_of(model: Model) -> Iterator[tuple[torch.Tensor, torch.Tensor]]:
         yield cloud, 3.0 * torch.rand(1, queries, 3, generator=torch.Generator().manual_seed(1)) - 1.5
 
 
-def answers_of(model: Model, cloud: torch.Tensor, points: torch.Tensor) -> tuple[np.ndarray, ...]:
+def answers_of(model: Model, cloud: Tensor, points: Tensor) -> tuple[ndarray, ...]:
     with torch.inference_mode():
         code = model.network.encode(cloud, torch.tensor([[0.1, -0.2, -8.0]]))
         return tuple(part.numpy() for part in model.respond(model.network.query(code, points), points))
 
 
-def agree(found: dict[str, Any], expected: tuple[np.ndarray, ...]) -> None:
+def agree(found: JsonObject, expected: tuple[ndarray, ...]) -> None:
     for name, wanted in zip(ANSWERS, expected, strict=True):
         got = np.asarray(found[name])
         assert got.shape == wanted.shape
@@ -101,7 +103,11 @@ def agree(found: dict[str, Any], expected: tuple[np.ndarray, ...]) -> None:
     assert np.asarray(found["logits"]).std() > 100 * TOLERANCE, "the comparison would be empty"
 
 
-def export(case: str, place: Path, kind: str) -> tuple[Model, Path]:
+Exported = tuple[Model, Path]
+"""A model and the folder that it was exported to."""
+
+
+def export(case: str, place: Path, kind: str) -> Exported:
     """By the command, in a process of its own: the tests' shape checks know no sizes that are left open."""
     weights = case
     if case != SHIPPED:
@@ -142,9 +148,9 @@ def test_missing_packages_are_named_with_their_extra(tmp_path: Path, monkeypatch
     assert list(tmp_path.iterdir()) == []
 
 
-def raw_cloud(count: int, seed: int = 0) -> np.ndarray:
+def raw_cloud(count: int, seed: int = 0) -> ndarray:
     points = np.concatenate([seen(count - 5, seed), seen(count - 5, seed)[:5]])
-    return default_rng(seed).permutation(0.05 * points.astype(np.float64) + [0.1, -0.2, 0.7])
+    return default_rng(seed).permutation(0.05 * points.astype(float) + [0.1, -0.2, 0.7])
 
 
 @pytest.mark.parametrize("count", [40, 256, 1500, 5000])
@@ -168,7 +174,7 @@ def test_the_runner_prepares_clouds_as_the_model_does(count: int) -> None:
         (np.ones((40, 3)), "all points coincide"),
     ],
 )
-def test_the_runner_refuses_unusable_clouds(cloud: np.ndarray, text: str) -> None:
+def test_the_runner_refuses_unusable_clouds(cloud: ndarray, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         prepare(cloud, {"points": 256, "dense_factor": 8, "fewest_points_of_a_cloud": 32})
 
@@ -203,7 +209,7 @@ FULL_SIZE = "paper"
 
 
 @pytest.fixture(scope="module", params=[*CASES, FULL_SIZE, SHIPPED])
-def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[Model, Path]:
+def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """A model, and the folder of its graphs as the command writes it."""
     for package in ("onnx", "onnxscript", "onnxruntime"):
         pytest.importorskip(package, reason=f"{package} is not installed: pip install 'mereo[onnx]'")
@@ -211,7 +217,7 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
 
 
 @pytest.mark.slow
-def test_onnx_graphs_answer_as_the_network_and_the_folder_says_what_it_holds(exported: tuple[Model, Path]) -> None:
+def test_onnx_graphs_answer_as_the_network_and_the_folder_says_what_it_holds(exported: Exported) -> None:
     import onnxruntime
 
     model, folder = exported
@@ -243,7 +249,7 @@ runpy.run_path("mereo_onnx.py", run_name="__main__")
 
 
 @pytest.mark.slow
-def test_the_runner_answers_as_the_model_without_torch(exported: tuple[Model, Path]) -> None:
+def test_the_runner_answers_as_the_model_without_torch(exported: Exported) -> None:
     model, folder = exported
     cloud = raw_cloud(3000)
     low, high, size = cloud.min(axis=0), cloud.max(axis=0), np.ptp(cloud, axis=0).max()

@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from shapes import one
 from torch import Tensor, nn
+from torch.testing import assert_close
 from toy_scene import toy_scene
 
 from mereo.api.generate import generate
@@ -29,12 +30,12 @@ TINY = PRESETS["tiny"].network
 FOLDED = TINY.changed(points=64)
 
 
-def cloud_of(config: NetworkConfig, batch: int = 2, seed: int = 0) -> torch.Tensor:
+def cloud_of(config: NetworkConfig, batch: int = 2, seed: int = 0) -> Tensor:
     points = torch.randn(batch, config.points, 3, generator=torch.Generator().manual_seed(seed))
     return F.normalize(points, dim=-1)
 
 
-def viewpoint_of(batch: int = 2) -> torch.Tensor:
+def viewpoint_of(batch: int = 2) -> Tensor:
     return torch.tensor([[0.2, -0.1, -8.0]]).repeat(batch, 1)
 
 
@@ -137,7 +138,7 @@ def test_dropout_clears_its_share_and_only_in_training() -> None:
     assert kept.sum() / (whole > 0).sum() == pytest.approx(0.8, abs=0.02)
 
 
-def example_prediction() -> tuple[Prediction, torch.Tensor, torch.Tensor, torch.Tensor]:
+def example_prediction() -> tuple[Prediction, Tensor, Tensor, Tensor]:
     torch.manual_seed(0)
     prediction = Prediction(torch.randn(2, 5, 4), torch.randn(2, 5), torch.randn(2, 5, 3))
     return prediction, torch.randint(0, 4, (2, 5)), torch.randn(2, 5), F.normalize(torch.randn(2, 5, 3), dim=-1)
@@ -201,7 +202,7 @@ def test_a_folded_network_answers_the_same(config: NetworkConfig) -> None:
     with torch.inference_mode():
         expected, found = (each.query(each.encode(cloud, eye), queries) for each in (network, folded))
     for name in ("logits", "distance"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
+        assert_close(getattr(found, name), getattr(expected, name), rtol=1e-3, atol=1e-4)
     assert expected.logits.std() > 1e-2
     # the original stays as it was: it can still be saved
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
@@ -291,13 +292,13 @@ AXIS = torch.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
 SPACING = 2 * TEMPLATE_REACH / (TEMPLATE_NODES - 1)
 
 
-def lookup_of(*fields: torch.Tensor) -> RestLookup:
+def lookup_of(*fields: Tensor) -> RestLookup:
     lookup = RestLookup(8, len(fields))
     lookup.distance.copy_(torch.stack(fields))
     return lookup
 
 
-def random_rest(batch: int, queries: int, reach: float = 1.0) -> torch.Tensor:
+def random_rest(batch: int, queries: int, reach: float = 1.0) -> Tensor:
     return (torch.rand(batch, queries, 3, generator=torch.Generator().manual_seed(4)) * 2 - 1) * reach
 
 
@@ -310,7 +311,7 @@ def test_linear_fields_are_read_exactly_and_along_the_right_axes() -> None:
 def test_grid_of_a_ball_is_its_signed_distance() -> None:
     """A ball fills the rest box: its radius is the unit of length."""
     ball = toy_scene().rest.segments[3]
-    grid = rest_distances(one(ball)).astype(np.float64)
+    grid = rest_distances(one(ball)).astype(float)
     nodes = np.stack(np.meshgrid(*(AXIS.numpy(),) * 3, indexing="ij"), axis=-1)
     assert np.abs(grid[0] - (np.linalg.norm(nodes, axis=-1) - 1)).max() < 0.02  # the ball is a polyhedron
 
@@ -336,7 +337,7 @@ def test_a_new_lookup_changes_no_answer() -> None:
     with torch.inference_mode():
         before, after = (network(cloud, viewpoint_of(), queries).prediction for network in (plain, added))
     for answer, same in zip(after[:3], before[:3], strict=True):
-        torch.testing.assert_close(answer, same)  # products of other widths may be added in another order
+        assert_close(answer, same)  # products of other widths may be added in another order
     assert before.rest is None and after.rest.shape == queries.shape
 
 

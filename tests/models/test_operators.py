@@ -6,6 +6,8 @@ import sys
 import pytest
 import torch
 import torch.nn.functional as F
+from torch import Tensor
+from torch.testing import assert_close
 
 from mereo.models.export.onnx_export import trilinear
 from mereo.models.neighbors import _by_rank, ball_query, gather, nearest, squared_distances
@@ -17,11 +19,11 @@ from mereo_learning.losses import rest_loss
 TINY = PRESETS["tiny"].network
 
 
-def random_points(batch: int, count: int, seed: int = 0) -> torch.Tensor:
+def random_points(batch: int, count: int, seed: int = 0) -> Tensor:
     return torch.rand(batch, count, 3, generator=torch.Generator().manual_seed(seed)) * 2 - 1
 
 
-def slow_ball_query(centers: torch.Tensor, points: torch.Tensor, radius: float, limit: int) -> torch.Tensor:
+def slow_ball_query(centers: Tensor, points: Tensor, radius: float, limit: int) -> Tensor:
     result = torch.empty(*centers.shape[:2], limit, dtype=torch.long)
     for b in range(len(centers)):
         for m, center in enumerate(centers[b]):
@@ -78,11 +80,11 @@ def test_compiled_networks_call_the_same_searches() -> None:
     assert done.returncode == 0, done.stderr
 
 
-def matrices(count: int) -> torch.Tensor:
+def matrices(count: int) -> Tensor:
     return torch.randn(count, 3, 3, generator=torch.Generator().manual_seed(0))
 
 
-def special() -> torch.Tensor:
+def special() -> Tensor:
     """Equal singular values, rank two, a reflection, columns in no order of length, and values far apart."""
     flat = matrices(1)[0].clone()
     flat[:, 2] = flat[:, 0] + flat[:, 1]
@@ -91,14 +93,14 @@ def special() -> torch.Tensor:
 
 
 @pytest.mark.parametrize("matrix", [matrices(200), special()], ids=["random", "special"])
-def test_svd_has_orthogonal_factors_that_multiply_to_the_matrix(matrix: torch.Tensor) -> None:
+def test_svd_has_orthogonal_factors_that_multiply_to_the_matrix(matrix: Tensor) -> None:
     u, values, vh = svd3(matrix)
     identity = torch.eye(3).expand_as(matrix)
-    torch.testing.assert_close(u.transpose(1, 2) @ u, identity, atol=1e-5, rtol=0)
-    torch.testing.assert_close(vh @ vh.transpose(1, 2), identity, atol=1e-5, rtol=0)
+    assert_close(u.transpose(1, 2) @ u, identity, atol=1e-5, rtol=0)
+    assert_close(vh @ vh.transpose(1, 2), identity, atol=1e-5, rtol=0)
     size = matrix.abs().amax(dim=(1, 2), keepdim=True)
-    torch.testing.assert_close((u * values[:, None]) @ vh / size, matrix / size, atol=1e-5, rtol=0)
-    torch.testing.assert_close(values / size[:, 0], torch.linalg.svdvals(matrix) / size[:, 0], atol=1e-5, rtol=0)
+    assert_close((u * values[:, None]) @ vh / size, matrix / size, atol=1e-5, rtol=0)
+    assert_close(values / size[:, 0], torch.linalg.svdvals(matrix) / size[:, 0], atol=1e-5, rtol=0)
 
 
 def test_rigid_fits_are_those_of_torchs_svd(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,10 +110,10 @@ def test_rigid_fits_are_those_of_torchs_svd(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(torch.linalg, "svd", svd3)
     found = fit_rigid(source, target + 3 * source)
     for name in ("rotation", "shift"):
-        torch.testing.assert_close(getattr(found, name), getattr(expected, name), atol=2e-5, rtol=0)
+        assert_close(getattr(found, name), getattr(expected, name), atol=2e-5, rtol=0)
     flat = source * torch.tensor([1.0, 1.0, 0.0])
     mirrored = fit_rigid(flat, flat * torch.tensor([1.0, -1.0, 1.0]))
-    torch.testing.assert_close(torch.linalg.det(mirrored.rotation), torch.ones(50), atol=1e-5, rtol=0)
+    assert_close(torch.linalg.det(mirrored.rotation), torch.ones(50), atol=1e-5, rtol=0)
 
 
 def test_sampling_is_torchs_also_on_nodes_and_beyond_the_border() -> None:
@@ -120,7 +122,7 @@ def test_sampling_is_torchs_also_on_nodes_and_beyond_the_border() -> None:
     places = 3 * torch.rand(1, 4, 25, 2, 3, generator=generator) - 1.5
     places[0, 0, :3, 0] = torch.tensor([[1.0, 1.0, 1.0], [-1.0, -1.0, -1.0], [0.0, 1.0, -1.0]])
     expected = F.grid_sample(volume, places, padding_mode="border", align_corners=True)
-    torch.testing.assert_close(trilinear(volume, places, 0, 1, True), expected, atol=1e-5, rtol=0)
+    assert_close(trilinear(volume, places, 0, 1, True), expected, atol=1e-5, rtol=0)
 
 
 def random_motion(batch: int, seed: int = 0) -> Alignment:

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 import torch
 from analytic import untrained
+from folder_contents import run_mereo
+from numpy.random import default_rng
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 import mereo
-from mereo import __main__ as command_line
 from mereo.io.checked_tensors import pack_tensors, unpack_tensors
 from mereo.models.weights import load_model, save_model, trained_steps, weights_bytes
 from mereo.models.weights_place import NOT_SHIPPED, find_weights, shipped_names
@@ -39,7 +40,7 @@ def changed(folder: Path, change: Change, with_states: bool = False) -> Path:
     return path
 
 
-WRONG: dict[str, Change] = {
+WRONG = {
     "has weights format None": lambda h, t: [],
     "a header with a wrong 'names'": lambda h, t: h.update(names="ab"),
     "and nested segments disagree": lambda h, t: h.update(nested=[["a", "c"]]),
@@ -58,7 +59,7 @@ WRONG: dict[str, Change] = {
     "NaN or infinity in the tensor decoder.head.bias": lambda h, t: t.update({BIAS: torch.ones(7) / 0}),
 }
 
-WRONG_STATES: dict[str, Change] = {
+WRONG_STATES = {
     "nothing is called 'pair_index'": lambda h, t: t.pop("states.pair_index") is None or None,
     "nothing is called": lambda h, t: h.pop("states") and None,
     "there is NaN or infinity in states.mean": lambda h, t: t["states.mean"].fill_(float("nan")) is None or None,
@@ -80,15 +81,15 @@ def test_what_is_wrong_with_weights_is_one_sentence(text: str, tmp_path: Path) -
 def test_names_that_look_like_markup_are_printed_unchanged(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     weights = changed(tmp_path, lambda h, t: h.update(names=["[/x]", ":heart:[red]"]))
     cloud = tmp_path / "[red] [y].npy"
-    np.save(cloud, np.random.default_rng(0).normal((0, 0, 20), 1, (200, 3)))
+    np.save(cloud, default_rng(0).normal((0, 0, 20), 1, (200, 3)))
     options = ["--output", str(tmp_path / "out"), "--resolution", "8", "--method", "network"]
-    assert command_line.main(["reconstruct", str(cloud), "--weights", str(weights), *options]) == 4, "the network alone"
+    assert run_mereo("reconstruct", cloud, "--weights", weights, *options) == 4, "the network alone"
     printed = capsys.readouterr().out
     assert all(text in printed for text in ("[red] [y].npy", "[/x]", ":heart:[red]"))
 
 
 def said(capsys: pytest.CaptureFixture, *arguments: str | Path) -> str:
-    assert command_line.main(["weights", *map(str, arguments)]) == 0
+    assert run_mereo("weights", *arguments) == 0
     return capsys.readouterr().out
 
 
@@ -140,5 +141,5 @@ def test_weights_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture) -> N
     assert "none: the network answers alone" in text and "true size not known" in text and "Not measured yet" in text
     (tmp_path / "empty").mkdir()
     for name, sentence in (("checkpoint.safetensors", "is not a safetensors file"), ("empty", "holds no weights")):
-        assert command_line.main(["weights", "list", str(tmp_path / name)]) == 2
+        assert run_mereo("weights", "list", tmp_path / name) == 2
         assert sentence in capsys.readouterr().err

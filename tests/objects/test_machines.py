@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from manifold3d import Manifold
+from numpy import ndarray
 from numpy.random import Generator, default_rng
 from solid_pairs import gap, overlapping_pairs
 
@@ -26,7 +27,7 @@ def motions(crank_rad: float) -> dict[str, Deformation]:
     return dict(zip(NAMES, engine.deformations_at(crank_rad), strict=True))
 
 
-def moved(deformation: Deformation, *point: float) -> np.ndarray:
+def moved(deformation: Deformation, *point: float) -> ndarray:
     return deformation(np.array([point]))[0]
 
 
@@ -155,16 +156,14 @@ def test_poses_in_which_parts_meet_are_refused(angles_deg: tuple[float, ...], pa
 # --- lizard -----------------------------------------------------------------------------------------------------------
 
 
-def extreme_pose(rng: Generator) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def extreme_pose(rng: Generator) -> tuple[ndarray, dict[str, ndarray]]:
     limits = np.column_stack([np.full((len(SPINE), 2), lizard.SPINE_PLAY_RAD), lizard.SPINE_LIMIT_RAD])
     swing = np.array([[lizard.LEG_PLAY_RAD] * 2 + [limit] for limit in (lizard.SWING_RAD, lizard.FOOT_RAD)])
     legs = {name: rng.choice([-1.0, 1.0], size=(2, 3)) * swing for name in lizard.LEGS}
     return rng.choice([-1.0, 1.0], size=limits.shape) * limits, legs
 
 
-def neighbours(
-    spine: np.ndarray, legs: dict[str, np.ndarray]
-) -> Iterator[tuple[Manifold, Manifold, np.ndarray, np.ndarray]]:
+def neighbours(spine: ndarray, legs: dict[str, ndarray]) -> Iterator[tuple[Manifold, Manifold, ndarray, ndarray]]:
     """Every two links that share a knuckle, with their motions: the socket's first."""
     links, motions = spine_links(), lizard.spine_motions(spine)
     yield from zip(links[:-1], links[1:], motions[:-1], motions[1:], strict=True)
@@ -189,7 +188,7 @@ def test_a_chain_of_knuckles_moves_every_link_rigidly() -> None:
     for number, link in enumerate(spine_links()):
         if number > 0:
             motion = follow(motion, SPINE[number - 1], vectors[number - 1])
-        points = np.array(link.to_mesh().vert_properties[:, :3], dtype=float)
+        points = np.array(link.to_mesh().vert_properties[:, :3], float)
         assert np.allclose(chain(points), points @ motion[:3, :3].T + motion[:3, 3], atol=1e-9)
 
 

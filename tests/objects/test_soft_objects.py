@@ -10,6 +10,7 @@ from numpy.random import default_rng
 from scipy.spatial import cKDTree
 
 from mereo.deformation.maps import Deformation, jacobian
+from mereo.geometry.conventions import Triple
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.scenes.registry import load_scene
 from mereo_objects import human, rope, sheet
@@ -93,7 +94,7 @@ def body(require_asset: Callable[[str], Path]) -> None:
         require_asset(f"human/{name}")
 
 
-def posed(**angles_deg: tuple[float, float, float]) -> PosedBody:
+def posed(**angles_deg: Triple) -> PosedBody:
     angles = np.zeros((len(JOINTS), 3))
     for name, turns in angles_deg.items():
         angles[NAMES.index(name.replace("_L", ".L").replace("_R", ".R"))] = np.deg2rad(turns)

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 from analytic import Distance, ball, half, logits_of, plate, union
+from numpy import ndarray
 from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.ndimage import map_coordinates
 
@@ -14,7 +16,7 @@ from mereo.reconstruction.isosurfaces import Extraction, Field, _grid, extract, 
 BOX = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
 
 
-def run(field: Field, segments: int = 1, resolution: int = 40, box: np.ndarray = BOX, **options: bool) -> Extraction:
+def run(field: Field, segments: int = 1, resolution: int = 40, box: ndarray = BOX, **options: bool) -> Extraction:
     return extract(field, box, resolution, ("left", "right")[:segments], PALETTE[:segments], **options)
 
 
@@ -25,7 +27,7 @@ def euler_number(segment: Segment) -> int:
 
 def small_balls(seed: int) -> Distance:
     """Twelve balls of radius 0.6 to 3 voxels; a coarse cell has 4."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     voxel = 2 / 40
     return union(*(ball(tuple(rng.uniform(-0.8, 0.8, 3)), rng.uniform(0.6, 3.0) * voxel) for _ in range(12)))
 
@@ -59,7 +61,7 @@ def test_a_surface_once_met_is_followed_to_its_end() -> None:
     turn = np.linspace(0.0, 5.0, 400)
     wire = union(*(ball((0.62 * np.cos(t), 0.62 * np.sin(t), -0.3 + 0.2 * t), 0.06) for t in turn[::4]))
     plain = logits_of(union(ball((0.62, 0.0, -0.3), 0.2), wire))
-    field: Field = lambda points: 8.0 * np.sign(plain(points))  # noqa: E731
+    field = lambda points: 8.0 * np.sign(plain(points))  # noqa: E731
     fine, dense = run(field), run(field, dense=True)
     assert_array_equal(fine.grid.labels, dense.grid.labels)
     assert fine.grid.labels[:, :, -7:].any(), "the wire reaches up"
@@ -96,7 +98,7 @@ def test_neighbours_share_their_interface_and_volumes_add_up() -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_a_field_and_its_negative_have_one_surface_with_its_faces_turned(seed: int) -> None:
     """Also where opposite corners of a cell's side are alike, as on most sides of noise."""
-    field = np.pad(np.random.default_rng(seed).normal(size=(12, 13, 14)), 1, constant_values=-1.0)
+    field = np.pad(default_rng(seed).normal(size=(12, 13, 14)), 1, constant_values=-1.0)
     vertices, faces = zero_surface(field)
     again, turned = zero_surface(-field)
     assert_array_equal(vertices, again)
@@ -145,6 +147,6 @@ def test_locate_grows_until_the_object_is_inside() -> None:
         (BOX, 1000, "resolution 1000 makes a grid of 1001 x 1001 x 1001 nodes"),
     ],
 )
-def test_impossible_grids(box: np.ndarray, resolution: int, text: str) -> None:
+def test_impossible_grids(box: ndarray, resolution: int, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         _grid(box, resolution)

@@ -5,12 +5,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 from two_balls import front
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import Triple
 from mereo.geometry.downsampling import random_subset, thin_to_grid
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import longest_side
@@ -24,11 +26,11 @@ from mereo.synthesis.examples import sample_view
 from mereo_learning.scans import SCANS, bunny_scan
 
 
-def half_ball(count: int = 3000, center: tuple[float, float, float] = (0.0, 0.0, 0.8)) -> np.ndarray:
+def half_ball(count: int = 3000, center: Triple = (0.0, 0.0, 0.8)) -> ndarray:
     return front(center, 0.1, -1.0, count)
 
 
-def wall(count: int = 6000, z: float = 1.5) -> np.ndarray:
+def wall(count: int = 6000, z: float = 1.5) -> ndarray:
     x, y = default_rng(1).uniform(-0.6, 0.6, (2, count))
     return np.column_stack([x, y, z + 0.1 * x + default_rng(2).normal(0, 0.002, count)])
 
@@ -39,13 +41,13 @@ EVERYTHING = np.concatenate([BALL, WALL, STRAYS])
 
 
 def isolate(
-    points: np.ndarray, config: IsolationConfig, unit_m: float = 1.0
+    points: ndarray, config: IsolationConfig, unit_m: float = 1.0
 ) -> tuple[PointCloud, tuple[IsolationStep, ...]]:
     found = find_object(observe(PointCloud(points), unit_m=unit_m).frame, config)
     return found.cloud, found.steps
 
 
-def kept(points: np.ndarray, config: IsolationConfig, unit_m: float = 1.0) -> np.ndarray:
+def kept(points: ndarray, config: IsolationConfig, unit_m: float = 1.0) -> ndarray:
     return isolate(points, config, unit_m)[0].points
 
 
@@ -157,7 +159,7 @@ SEED, OFF = 700_000, 3.0
 """Training draws, and the distance in scene units from which on a point is a stray: six times the noise."""
 
 
-def views(name: str, sensor: Sensor, which: Iterable[int]) -> list[tuple[np.ndarray, np.ndarray]]:
+def views(name: str, sensor: Sensor, which: Iterable[int]) -> list[tuple[ndarray, ndarray]]:
     """Points of views, and whether each is on the object."""
     scene, settings = load_scene(name).for_seed(SEED), GenerateConfig(sensor=SENSORS[sensor])
     seen = (sample_view(scene, settings, example_rng(SEED, index)) for index in which)
@@ -165,13 +167,13 @@ def views(name: str, sensor: Sensor, which: Iterable[int]) -> list[tuple[np.ndar
     return [(points, np.asarray(Solids(view.mesh).nearest(points).distance) < OFF) for view, points in clouds]
 
 
-def strays_and_stretch(reading: Reading, points: np.ndarray, genuine: np.ndarray) -> tuple[int, float]:
+def strays_and_stretch(reading: Reading, points: ndarray, genuine: ndarray) -> tuple[int, float]:
     """How many strays are left, and how many times as long the longest side is as that of the object."""
     left = set(map(tuple, points[~genuine])) & set(map(tuple, reading.cloud.points))
     return len(left), longest_side(reading.cloud.points) / longest_side(points[genuine])
 
 
-def wall_behind_plate(rim: int = 2, fragments: int = 8) -> tuple[np.ndarray, np.ndarray]:
+def wall_behind_plate(rim: int = 2, fragments: int = 8) -> tuple[ndarray, ndarray]:
     """A plate of 30 x 30 pixels and pieces of a rim of the wall, in metres; whether each point is of the plate."""
     u, v = (axis.ravel() for axis in np.meshgrid(np.arange(30 + rim) - 15.0, np.arange(30) - 15.0))
     genuine = u < 15

@@ -5,13 +5,13 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
 from camera_files import write_camera
 from folder_contents import read_json
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 import mereo
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.transforms import rigid, transform_points, unit_rows
+from mereo.io.atomic_files import JsonObject
 from mereo.io.config import InputConfig
 from mereo.io.readers import InputWarning
 from mereo.io.sensor_frame import SensorFrame, read_frame
@@ -37,7 +38,7 @@ CAMERA = Camera(20, 10, 30.0, 30.0, 10.0, 5.0)
 def folder(tmp_path: Path) -> Path:
     """d.png shows 50 pixels at the value 2500; k.json is its camera."""
     write_camera(tmp_path / "k.json", CAMERA)
-    depth = np.zeros((10, 20), dtype=np.uint16)
+    depth = np.zeros((10, 20), np.uint16)
     depth[2:7, 5:15] = 2500
     Image.fromarray(depth).save(tmp_path / "d.png")
     np.save(tmp_path / "d.npy", depth.astype(np.float32) / 5000)
@@ -117,7 +118,7 @@ FILE = Path("k.json")
         ("c.ply", {"depth_scale": 1000.0}, "is read as a point cloud"),
     ],
 )
-def test_contradictory_inputs(name: str, options: dict[str, Any], text: str) -> None:
+def test_contradictory_inputs(name: str, options: JsonObject, text: str) -> None:
     with pytest.raises(ValueError, match=text):
         read_frame(Path(name), InputConfig(**options))
 
@@ -128,7 +129,7 @@ BASE = rigid(Rotation.from_euler("xyz", [-110.0, 20.0, 5.0], degrees=True).as_ma
 CAP = default_rng(3).uniform((-0.1, -0.1, 0.5), (0.1, 0.1, 0.7), (60, 3)).astype(np.float32)
 
 
-def stored_at(pose: np.ndarray, points: np.ndarray) -> bytes:
+def stored_at(pose: ndarray, points: ndarray) -> bytes:
     """A PCD file with a camera's pose in its header."""
     qx, qy, qz, qw = Rotation.from_matrix(pose[:3, :3]).as_quat().tolist()
     words = " ".join(map(repr, [*pose[:3, 3].tolist(), qw, qx, qy, qz]))
@@ -137,7 +138,7 @@ def stored_at(pose: np.ndarray, points: np.ndarray) -> bytes:
 
 
 def test_a_stated_viewpoint_is_used_where_the_points_fit_it(tmp_path: Path) -> None:
-    path, based = tmp_path / "c.pcd", transform_points(BASE, CAP.astype(np.float64))
+    path, based = tmp_path / "c.pcd", transform_points(BASE, CAP.astype(float))
     path.write_bytes(stored_at(BASE, based))
     with pytest.warns(
         InputWarning, match=r"c.pcd states a camera's pose \(VIEWPOINT\); .* moved into the camera's axes"
@@ -163,7 +164,7 @@ def test_a_stated_viewpoint_is_used_where_the_points_fit_it(tmp_path: Path) -> N
 
 
 def test_a_camera_pose_moves_any_cloud_into_the_cameras_axes(folder: Path) -> None:
-    based = transform_points(BASE, CAP.astype(np.float64))
+    based = transform_points(BASE, CAP.astype(float))
     np.save(folder / "c.npy", based)
     np.savetxt(folder / "pose.txt", BASE)
     for frame in (
@@ -212,11 +213,11 @@ def test_coordinates_of_a_map_keep_their_digits(tmp_path: Path) -> None:
     ],
 )
 def test_points_behind_the_camera_get_the_cure_of_their_axes(turn: list[list[int]], cure: str) -> None:
-    matrix = np.array(turn, dtype=np.float64)
+    matrix = np.array(turn, float)
     with pytest.raises(ValueError, match=f"points have z <= 0, behind the camera; .*{cure}") as caught:
         checked_points(PointCloud(CAP @ matrix.T))
     rows = str(caught.value).partition("rows ")[2].partition(" and")[0].split(", ")
-    pose = np.array([row.split() for row in [*rows, "0 0 0 1"]], dtype=np.float64)
+    pose = np.array([row.split() for row in [*rows, "0 0 0 1"]], float)
     frame = mereo.load_frame(CAP @ matrix.T, camera_pose=pose)
     assert_allclose(checked_points(frame.cloud), CAP)
     with pytest.raises(ValueError, match=r"--camera-pose FILE\) for a cloud in a robot's base or a map, or .*scanner"):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy import ndarray
 from numpy.linalg import norm
 from PIL import Image
 from scipy import ndimage
@@ -19,7 +20,7 @@ from mereo.api.objects import load_object
 from mereo.api.reconstruct import Tracker, load_frame, reconstruct
 from mereo.fitting.problem.correspondences import NoFit
 from mereo.geometry.camera import Camera
-from mereo.geometry.conventions import Way
+from mereo.geometry.conventions import Pair, Way
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.config import InputConfig
@@ -91,10 +92,10 @@ PLACED = {
 """Rotation vector of the bottle about its middle, and where that is, metres: by the outline in the whole image."""
 
 
-def masked_bottle(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
+def masked_bottle(folder: Path, name: str) -> tuple[ndarray, ndarray]:
     """Write the camera and a mask two pixels too wide; return the bottle's vertices at rest and their places."""
     lines = [line.split() for line in (STEREO / "schauma.obj").read_text("utf-8").splitlines()]
-    vertices = np.array([line[1:4] for line in lines if line[:1] == ["v"]], dtype=float)
+    vertices = np.array([line[1:4] for line in lines if line[:1] == ["v"]], float)
     faces = np.array([[int(part.split("/")[0]) for part in line[1:4]] for line in lines if line[:1] == ["f"]]) - 1
     turn, place = PLACED[name]
     placed = Rotation.from_rotvec(turn).apply(vertices - np.unique(vertices, axis=0).mean(axis=0)) + place
@@ -110,7 +111,7 @@ def masked_bottle(folder: Path, name: str) -> tuple[np.ndarray, np.ndarray]:
 @pytest.mark.slow
 @pytest.mark.parametrize("point, known", [((400, 238), {True}), ((600, 150), {False, "unsure", None})])
 def test_a_point_on_the_bottle_is_believed_and_one_on_the_monitor_is_not(
-    tmp_path: Path, point: tuple[int, int], known: set[object]
+    tmp_path: Path, point: Pair, known: set[object]
 ) -> None:
     masked_bottle(tmp_path, "200")
     bottle = load_object(STEREO / "schauma.obj", units="m", deformations="rigid")

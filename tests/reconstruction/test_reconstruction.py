@@ -15,6 +15,7 @@ from analytic import AnalyticModel, ball, logits_of, union
 from answers import answer_to, reconstruct
 from folder_contents import read_json
 from many_frames import content, frames, loads, run
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from two_balls import BIG, NAMES, SMALL, front, scene, two_balls
 
@@ -75,7 +76,7 @@ def test_parts_are_counted_as_a_person_would_and_nothing_is_removed() -> None:
 
 
 def test_specks_and_gaps_below_a_voxel_are_no_parts() -> None:
-    mask = np.zeros((40, 8, 8), dtype=bool)
+    mask = np.zeros((40, 8, 8), bool)
     mask[:20, 2:5, 2:5] = mask[20:30, 5:7, 5:7] = True  # they touch at a corner
     assert count_parts(mask) == 1
     mask[38, 0, 0] = True
@@ -108,7 +109,7 @@ def test_files(answer: Answer, tmp_path: Path) -> None:
     assert_allclose(place[:3], np.array(BIG[0]) * ([1, -1, -1] if frame == "camera" else 1), atol=1e-6)
 
 
-FAR_BEHIND = np.random.default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
+FAR_BEHIND = default_rng(1).uniform((-0.3, -0.3, 0.9), (0.3, 0.3, 1.3), (30, 3))
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 import pytest
 from camera_files import write_camera
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -49,7 +50,7 @@ from mereo.synthesis.examples import View, sample_view
 from mereo_serving.options import FrameOptions
 
 Cut = Literal["none", "tool", "hand"]
-CUTS: tuple[Cut, ...] = ("none", "tool", "hand")
+CUTS = ("none", "tool", "hand")
 AWAY = np.array([0.0, 0.0, 1.0])
 
 
@@ -75,9 +76,9 @@ def frame_of(image: DepthImage, whole: DepthImage | None = None) -> SensorFrame:
     return SensorFrame(Path("simulated"), image.to_points(), None, "camera", image, whole=whole)
 
 
-def kinds(lines: SightLines, camera: Camera) -> np.ndarray:
+def kinds(lines: SightLines, camera: Camera) -> ndarray:
     """Image of "p" and "u" where a line of sight is kept, "" elsewhere; each line is in one pixel of its own."""
-    image = np.full((camera.height, camera.width), "", dtype="U1")
+    image = np.full((camera.height, camera.width), "", "U1")
     for points, kind in ((lines.past, "p"), (lines.unknown, "u")):
         rows, columns = pixels(points, camera)
         inside = (rows >= 0) & (rows < camera.height) & (columns >= 0) & (columns < camera.width)
@@ -101,7 +102,7 @@ def occlude(view: View, kind: Cut, sensor: SensorConfig = SENSORS["paper"], wall
     return Occluded(observe(solids, camera, 0.0, sensor, rng, around=around), render_depth(solids, camera))
 
 
-def surrounded(image: np.ndarray) -> np.ndarray:
+def surrounded(image: ndarray) -> ndarray:
     """Pixels around which all 5 x 5 are true."""
     windows = np.lib.stride_tricks.sliding_window_view(np.pad(image, 2, constant_values=True), (5, 5))
     return np.asarray(windows.all(axis=(2, 3)))
@@ -178,11 +179,11 @@ def test_what_was_to_be_seen_and_was_not_counts_where_nothing_says_what_is_there
 # --- images by hand ---------------------------------------------------------------------------------------------------
 
 WIDE = Camera(60, 50, 80.0, 80.0, 30.0, 25.0)
-SHOWN = np.zeros((50, 60), dtype=bool)
+SHOWN = np.zeros((50, 60), bool)
 SHOWN[15:35, 20:40] = True
 
 
-def scene() -> np.ndarray:
+def scene() -> ndarray:
     """A square at 1 m before a wall at 2 m; a strip at 0.8 m left of it, nothing measured above row 10."""
     depth = np.where(SHOWN, 1.0, 2.0)
     depth[:, :19] = 0.8
@@ -194,7 +195,7 @@ WHOLE = DepthImage(scene(), WIDE)
 CUT = frame_of(DepthImage(np.where(SHOWN, WHOLE.depth, 0.0), WIDE), WHOLE)
 
 
-def pixels(points: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+def pixels(points: ndarray, camera: Camera) -> tuple[ndarray, ndarray]:
     """Rows and columns of the pixels that points are seen in."""
     columns, rows = np.floor(camera.project(points)).astype(int).T
     return rows, columns
@@ -223,7 +224,7 @@ def test_a_table_that_the_object_lies_on_is_free_up_to_its_surface_and_no_farthe
 
 def test_many_lines_are_thinned_far_from_the_object_only() -> None:
     camera = Camera(600, 500, 800.0, 800.0, 300.0, 250.0)
-    shown, depth = np.kron(SHOWN, np.ones((10, 10), dtype=bool)), np.kron(scene(), np.ones((10, 10)))
+    shown, depth = np.kron(SHOWN, np.ones((10, 10), bool)), np.kron(scene(), np.ones((10, 10)))
     kept = kinds(lines_of_image(DepthImage(depth, camera), shown), camera) != ""
     assert 0.5 * MOST_LINES < kept.sum() <= MOST_LINES
     distance = distance_transform_edt(~shown)

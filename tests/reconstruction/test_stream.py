@@ -14,9 +14,10 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from folder_contents import run_mereo
+from numpy.random import default_rng
 from written_results import segments
 
-from mereo import __main__ as command_line
 from mereo.cli import stream as stream_module
 from mereo.cli.answers import StreamCommand
 from mereo.cli.stream import (
@@ -33,6 +34,7 @@ from mereo.cli.stream import (
     watched_frames,
 )
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import Names
 from mereo.io.config import InputConfig
 from mereo.reconstruction.config import IsolationConfig
 from mereo.scenes.registry import load_scene
@@ -59,7 +61,7 @@ def test_every_frame_is_answered_in_order_when_asked_at_the_recorded_pace(monkey
 
 def test_a_slow_answer_gets_the_latest_frame_and_dropped_ones_are_not_decoded() -> None:
     arrived, begun = ([threading.Event(), threading.Event()] for _ in range(2))
-    decoded: list[str] = []
+    decoded = []
 
     def frames() -> Iterator[StreamFrame]:
         yield frame(0)
@@ -181,7 +183,7 @@ def test_an_empty_or_restless_file_is_waited_for_within_bounds(watched: WatchedF
 def test_watching_ends_with_ctrl_c(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    np.save(tmp_path / "a.npy", np.random.default_rng(0).uniform(1, 2, (500, 3)))
+    np.save(tmp_path / "a.npy", default_rng(0).uniform(1, 2, (500, 3)))
     monkeypatch.setattr("mereo.cli.stream.answer_frame", Mock(side_effect=KeyboardInterrupt))
     command = StreamCommand(str(tmp_path), weights="rope", watch=True, method="network")
     assert stream_reconstructions(command).answered == 0
@@ -284,7 +286,7 @@ def test_sources_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.M
         stream_reconstructions(StreamCommand(str(tmp_path), weights="none", surfaces=tmp_path / "a.ply"))
 
 
-def run(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, ...], *more: str) -> int:
+def run(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: Names, *more: str) -> int:
     """Exit code of a stream in which every frame is answered with the same surfaces."""
     answered = FrameAnswer(segments(), {})
     outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
@@ -292,7 +294,7 @@ def run(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: tuple[str, ...]
     monkeypatch.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
     monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
     monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))
-    return command_line.main(["stream", "-", "--weights", "rope", "--surfaces", str(surfaces), *more])
+    return run_mereo("stream", "-", "--weights", "rope", "--surfaces", surfaces, *more)
 
 
 def test_a_stream_replaces_no_surfaces_unless_forced(

@@ -8,19 +8,20 @@ import numpy as np
 import pytest
 import trimesh
 from analytic import untrained
-from folder_contents import read_json
-from numpy.linalg import det, norm
+from folder_contents import read_json, run_mereo
+from numpy import ndarray
+from numpy.linalg import det, norm, svd
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import write_bar
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
-from mereo import __main__ as command_line
 from mereo.api.words import python_words
 from mereo.deformation.maps import Deformation
 from mereo.fitting.registration.register import CloudToFit, Registrar, fit_frame
 from mereo.fitting.registration.registration import Registration, nearest_labels
+from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import rigid, transform_points
@@ -51,7 +52,7 @@ SCENE = toy_scene()
 T = rigid(Rotation.from_rotvec([0.4, -1.0, 0.3]).as_matrix(), np.array([5.0, -3.0, 90.0]))
 
 
-def registered(model: StatisticalModel, material: np.ndarray, unit: float = 1.0) -> Registration:
+def registered(model: StatisticalModel, material: ndarray, unit: float = 1.0) -> Registration:
     return Registration(model, unit * material, "modes", np.zeros(model.count), unit, True, 1.0, True, 0.0)
 
 
@@ -71,7 +72,7 @@ def bent(model: StatisticalModel, state: State) -> Registration:
     return registered(model, transform_points(T, state_points(state, model.nodes, model.node_labels)))
 
 
-def table(points: np.ndarray, rotations: np.ndarray | None = None) -> PoseTable:
+def table(points: ndarray, rotations: ndarray | None = None) -> PoseTable:
     rows = tuple(("0",) * 7 for _ in points)
     return PoseTable(("x", "y", "z", "qx", "qy", "qz", "qw"), rows, ",", points, rotations)
 
@@ -103,10 +104,10 @@ def test_interior_points_follow_the_scenes_own_maps(registrar: Registrar, state:
         assert norm(found.content.points[labels == label] - truth, axis=1).max() < 0.1
 
 
-def polar(motion: Deformation, points: np.ndarray) -> np.ndarray:
+def polar(motion: Deformation, points: ndarray) -> ndarray:
     """Rotation of a map's Jacobian at points, by scipy-free polar decomposition of central differences."""
     columns = [(motion(points + e) - motion(points - e)) / 2e-4 for e in 1e-4 * np.eye(3)]
-    u, _, v = np.linalg.svd(np.stack(columns, axis=2))
+    u, _, v = svd(np.stack(columns, axis=2))
     return np.asarray(u @ v)
 
 
@@ -134,7 +135,7 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
     found, faces = carry(placed, bent).content.points, placed.content.mesh.segments[0].faces
     nearest = bent.to_camera(placed.content.points)
 
-    def longest(points: np.ndarray) -> float:
+    def longest(points: ndarray) -> float:
         return float(norm(points[faces] - points[np.roll(faces, 1, axis=1)], axis=2).max())
 
     assert longest(placed.content.points) <= 0.9 + 1e-9
@@ -210,7 +211,7 @@ HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
 """Between RAS and LPS."""
 
 
-def in_patient(registrar: Registrar, space: str | None) -> tuple[Registrar, np.ndarray]:
+def in_patient(registrar: Registrar, space: str | None) -> tuple[Registrar, ndarray]:
     """The object, whose own files lie far from the middle of a patient, and points inside it in their frame."""
     frame = SourceFrame(rigid(np.eye(3), np.array([-150.0, 40, 0])), 0.001, space)  # type: ignore[arg-type]
     model = replace(registrar.model, source_frame=frame)
@@ -316,7 +317,7 @@ def halves(dtype: str = "int16") -> Volume:
     return replace(grid, values=np.where(inside, np.where(grid.values[..., 0] < 0, 3, 7), 0).astype(dtype))
 
 
-def at_points(volume: Volume, points: np.ndarray) -> np.ndarray:
+def at_points(volume: Volume, points: ndarray) -> ndarray:
     index = np.rint(volume.index_of(points)).astype(int)
     return np.asarray(volume.values[tuple(index.T)])
 
@@ -340,7 +341,7 @@ def test_far_from_the_object_there_is_background(model: StatisticalModel) -> Non
     source = ramp("int16")
     found = resampled(source, here)
     assert found.content.values.dtype == np.int16
-    index = np.argwhere(np.ones(found.content.values.shape, dtype=bool))
+    index = np.argwhere(np.ones(found.content.values.shape, bool))
     centers = transform_points(found.content.T_world_index, index.astype(float))
     distance = here.solids.nearest(centers).distance * (here.solids.label(centers) == 0)
     width = carrying.MARGIN * model.half
@@ -436,10 +437,10 @@ def test_a_volume_beside_the_object_is_refused(registrar: Registrar) -> None:
 
 def test_labels_are_told_from_intensities() -> None:
     rng = default_rng(0)
-    blocks = np.kron(rng.permutation(216).reshape(6, 6, 6), np.ones((8, 8, 8), dtype=int))
+    blocks = np.kron(rng.permutation(216).reshape(6, 6, 6), np.ones((8, 8, 8), int))
     noise = rng.integers(0, 256, size=(40, 40, 40))
 
-    def of(values: np.ndarray) -> bool:
+    def of(values: ndarray) -> bool:
         return is_labels(Volume(values, np.eye(4)))
 
     assert of(blocks.astype(np.uint8)) and of((noise > 128).astype(np.int32))
@@ -459,7 +460,7 @@ def test_nifti_keeps_its_scaling(tmp_path: Path, registrar: Registrar, resized: 
 
 def test_a_volume_that_cannot_be_carried_says_why(tmp_path: Path) -> None:
     four = np.zeros((4, 5, 6, 2), np.float32)
-    color = np.zeros((4, 5, 6), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")])
+    color = np.zeros((4, 5, 6), [("R", "u1"), ("G", "u1"), ("B", "u1")])
     for values, message in (
         (four, "a.nii.gz has 4 dimensions; a volume that is carried has 3, with one number"),
         (four[..., 0] + np.nan, "a.nii.gz has NaN or infinite values; all must be finite"),
@@ -504,10 +505,10 @@ def folder(weights: Model, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(folder: Path, files: tuple[str, ...], *options: str, cloud: str = "cloud.npy", output: str = "out") -> int:
+def run(folder: Path, files: Names, *options: str, cloud: str = "cloud.npy", output: str = "out") -> int:
     arguments = ["reconstruct", str(folder / cloud), "--weights", str(folder / "rope.safetensors")]
     carried = [word for name in files for word in ("--carry", str(folder / name))]
-    return command_line.main([*arguments, "--output", str(folder / output), "--resolution", "32", *carried, *options])
+    return run_mereo(*arguments, "--output", folder / output, "--resolution", "32", *carried, *options)
 
 
 def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:

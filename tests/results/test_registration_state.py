@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from folder_contents import read_json
+from numpy.random import Generator
 from numpy.testing import assert_allclose, assert_array_equal
 from registered_states import SCENE, T, by_modes, placed
 
@@ -18,7 +19,6 @@ from mereo.models.model import Model
 from mereo.models.weights import load_model, save_model
 from mereo.results.state import (
     STATE,
-    RegistrationState,
     load_state,
     model_digest,
     read_state,
@@ -73,7 +73,7 @@ def test_a_state_of_other_weights_is_refused(model: StatisticalModel) -> None:
 
 
 def test_a_scene_that_has_changed_since_is_said(model: StatisticalModel) -> None:
-    def wider(rng: np.random.Generator) -> Any:
+    def wider(rng: Generator) -> Any:
         deformations = SCENE.sample_deformations(rng)
         shear = replace(deformations[0], a=deformations[0].a + 1.0)  # type: ignore[type-var]
         return (shear, shear, shear, replace(deformations[3], then=shear))  # type: ignore[type-var]
@@ -99,7 +99,7 @@ def test_a_name_in_a_file_runs_no_code(model: StatisticalModel, tmp_path: Path) 
 
 
 # what is wrong in a file, and where
-WRONG: dict[str, tuple[Callable[[dict[str, Any]], Any], str]] = {
+WRONG = {
     "key": (lambda facts: {**facts, "extra": 1}, "'extra'"),
     "large": (lambda facts: {**facts, "z": [1e9]}, "'z.0'"),
     "format": (lambda facts: {**facts, "format": 2}, "its format is 2; this mereo reads format 1"),
@@ -134,7 +134,7 @@ def test_folders_without_a_state_and_with_a_hostile_file_are_refused(tmp_path: P
 
 
 def test_a_damaged_number_of_coefficients_is_said(model: StatisticalModel) -> None:
-    state: RegistrationState = state_of(by_modes(model), "toy")
+    state = state_of(by_modes(model), "toy")
     short = state.model_copy(update={"z": state.z[:-1]})
     with pytest.raises(ValueError, match=f"has {model.count - 1} coefficients, but the model has {model.count} modes"):
         restored(short, model)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import untrained
+from folder_contents import run_mereo
 from numpy.random import default_rng
 from scene_files import HEAD, write_mesh
 from shapes import ball, box
@@ -193,6 +194,6 @@ def test_not_even_force_replaces_an_input(
     for name in ("weights.safetensors", "assets/bunny/bunny.off"):
         Path(name).write_text("precious")
     before = {path: path.read_bytes() for path in working_folder.rglob("*") if path.is_file()}
-    assert command_line.main([*command.format(working_folder).split(), "--force"]) == 2
+    assert run_mereo(*command.format(working_folder).split(), "--force") == 2
     assert re.search("is read.*; it is not replaced.*: choose another", capsys.readouterr().err)
     assert {path: path.read_bytes() for path in working_folder.rglob("*") if path.is_file()} == before

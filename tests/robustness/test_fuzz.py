@@ -13,11 +13,13 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from itertools import islice
+from math import inf
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from folder_contents import refusal
 from fuzz import TARGETS, fault_of, inputs, limits, listing, zipped
 from numpy.random import default_rng
 from numpy.testing import assert_array_equal
@@ -66,7 +68,7 @@ def test_many_damaged_files(name: str, tmp_path: Path, capfd: pytest.CaptureFixt
 
 
 RECONSTRUCT = "reconstruct {} --weights tiny.safetensors --resolution 8 --output out"
-COMMANDS: dict[str, str] = {
+COMMANDS = {
     **dict.fromkeys(("labelled.ply", "cloud.csv", "cloud.npz", "frames.db3"), RECONSTRUCT),
     "depth.png": f"{RECONSTRUCT} --intrinsics camera.json",
     "camera.json": f"{RECONSTRUCT.replace('{}', 'depth.png')} --intrinsics {{}}",
@@ -130,7 +132,7 @@ def complex_centres(content: bytes) -> bytes:
 
 def labels_of_infinity(content: bytes) -> bytes:
     nibabel = pytest.importorskip("nibabel")
-    return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), np.inf, "f4"), np.eye(4)).to_bytes())
+    return bytes(nibabel.Nifti1Image(np.full((4, 4, 4), inf, "f4"), np.eye(4)).to_bytes())
 
 
 def signalling_depth(content: bytes) -> bytes:
@@ -140,7 +142,7 @@ def signalling_depth(content: bytes) -> bytes:
     return file.getvalue()
 
 
-CASES: dict[str, tuple[str, Callable[[bytes], bytes], str | None]] = {
+CASES = {
     "pixels that OpenEXR prints about": ("depth.exr", chunk_size, "cannot be read as a depth image"),
     "a header of 4 GB": ("cloud.npy", at(6, b"\2\0" + b"\xff" * 4), "expected 4294967295 bytes"),
     "no array": ("surfaces.npz", lambda c: zipped({"a": b"text"}), "its entry 'a' is no array"),
@@ -199,7 +201,7 @@ def test_a_librarys_text_is_short_and_its_output_is_dropped(capfd: pytest.Captur
         os.write(2, b"text")
     assert capfd.readouterr() == ("", "")
     with quiet():
-        assert np.float64(1e308) * 10 == np.inf
+        assert np.float64(1e308) * 10 == inf
 
 
 # --- headers that lie, and files that unpack to far more than they are ------------------------------------------------
@@ -230,9 +232,8 @@ def test_a_volume_whose_header_lies_is_refused(tmp_path: Path) -> None:
         ("b.nrrd", nrrd("-5 -6 7", "raw", bytes(210)), "the size -5 x -6 x 7"),
     ):
         (tmp_path / name).write_bytes(content)
-        with pytest.raises(ValueError, match=f"{name}.*({sentence})") as caught:
+        with refusal(f"{name}.*({sentence})"):
             read_label_volume(tmp_path / name)
-        assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize("read", [read_label_volume, read_scalar_volume])
@@ -273,7 +274,7 @@ def test_a_volume_opens_no_file_outside_its_folder_and_none_that_is_no_file(tmp_
                 read_label_volume(folder / "a.nrrd")
 
 
-@pytest.mark.parametrize("axis", [np.nan, np.inf, 0.0])
+@pytest.mark.parametrize("axis", [np.nan, inf, 0.0])
 def test_a_volume_whose_axes_do_not_span_space_is_refused(axis: float, tmp_path: Path) -> None:
     nibabel = pytest.importorskip("nibabel")
     header = nibabel.Nifti1Header.from_fileobj(io.BytesIO(nifti(4, 4, 4)))
@@ -284,7 +285,7 @@ def test_a_volume_whose_axes_do_not_span_space_is_refused(axis: float, tmp_path:
         read_label_volume(tmp_path / "a.nii")
 
 
-BOMBS: dict[str, Callable[[Path], object]] = {"a.npz": read_point_cloud, "a.nrrd": read_label_volume}
+BOMBS = {"a.npz": read_point_cloud, "a.nrrd": read_label_volume}
 """Files of about a megabyte that unpack to one gigabyte."""
 
 
@@ -306,7 +307,7 @@ def test_what_takes_too_much_memory_is_refused(name: str, tmp_path: Path, monkey
 
 def test_a_pipe_or_device_that_is_named_like_a_file_is_refused_at_once(tmp_path: Path) -> None:
     """Nobody writes to this pipe: whoever opened it would wait for ever."""
-    readers: dict[str, Callable[[Path], object]] = {
+    readers = {
         ".ply": read_frame,
         ".npy": read_frame,
         ".bag": read_frame,

@@ -6,11 +6,13 @@ from contextlib import redirect_stdout
 from functools import lru_cache
 
 import pytest
+from folder_contents import run_mereo
 from fuzz import limits
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mereo import __main__ as command_line
+from mereo.geometry.conventions import Names
 
 COMMANDS = (
     *("demo", "experiment sampling", "bench missing", "view missing"),
@@ -35,11 +37,11 @@ VALUES = st.sampled_from(ODD) | st.text(max_size=8) | st.integers().map(str) | s
 
 
 @lru_cache
-def options(command: str) -> tuple[str, ...]:
+def options(command: str) -> Names:
     """Names of a command's options, from its help."""
     text, words = io.StringIO(), command.split(" missing")[0].split()
     with redirect_stdout(text), pytest.raises(SystemExit):
-        command_line.main([*(words[:1] if words[0] == "experiment" else words), "--help"])
+        run_mereo(*(words[:1] if words[0] == "experiment" else words), "--help")
     found = set(re.findall(r"--[a-z][a-z0-9.-]*[a-z0-9]", text.getvalue())) - {"--help"}
     assert found
     return tuple(sorted(found))

@@ -215,7 +215,7 @@ def test_what_is_round_or_falls_over_has_no_base() -> None:
 
 def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     file = write_mesh(dome(), tmp_path / "dome.obj")
-    sentences: list[str] = []
+    sentences = []
     path = write_scene_file([file], tmp_path / "dome.yaml", report=sentences.append)
     check_scene(str(path))
     _, sentence = sentences

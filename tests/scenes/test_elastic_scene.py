@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_cases import IN_FRONT, seen
+from numpy import ndarray
 from numpy.testing import assert_allclose, assert_array_equal
 from scene_files import HEAD, write_bar, write_mesh
 from scipy.spatial.transform import Rotation
@@ -60,7 +61,7 @@ def held(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scene, StatisticalMo
     return scene, scene_model(scene, 100)
 
 
-def off(model: StatisticalModel, found: np.ndarray, true: np.ndarray) -> float:
+def off(model: StatisticalModel, found: ndarray, true: ndarray) -> float:
     """Root mean square distance of material points, in half lengths."""
     return float(np.sqrt(((found - true) ** 2).sum(axis=1).mean()) / model.half)
 
@@ -123,7 +124,7 @@ def test_segments_that_do_not_touch_are_no_solid(tmp_path: Path) -> None:
         load_scene(str(path))
 
 
-def write_volume(folder: Path, nodes: np.ndarray, elements: np.ndarray) -> str:
+def write_volume(folder: Path, nodes: ndarray, elements: ndarray) -> str:
     """Block of an elastic solid of these tetrahedra, which are written into ``folder``."""
     np.savez(folder / "bar.npz", rest_nodes=nodes, tetrahedra=elements)
     return ELASTIC_BAR.replace("cells: 10", "tetrahedra: bar.npz")
@@ -183,7 +184,7 @@ def test_nodes_are_held_by_their_numbers_or_by_points_near_them(tmp_path: Path, 
 def test_a_volume_mesh_that_does_not_fit_is_refused_with_its_line(
     tmp_path: Path,
     volume: Tetrahedra,
-    change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]],
+    change: Callable[[ndarray, ndarray], tuple[ndarray, ndarray]],
     message: str,
 ) -> None:
     block = write_volume(tmp_path, *change(volume.nodes, volume.elements))
@@ -266,8 +267,8 @@ def test_a_given_pose_weighs_as_its_error_says(held: tuple[Scene, StatisticalMod
 
 def test_pairs_by_direction_tell_the_sides_of_a_thin_part_apart(model: StatisticalModel) -> None:
     samples = SampledSurface.of(model, 2000).posed(Posed(np.eye(3), np.array([0.0, 0.0, 120.0]), np.zeros(model.count)))
-    points, top = samples.position.astype(np.float64), samples.normal[:, 2] < -0.9
-    across, normals = np.ptp(points[:, 2]), samples.normal[top].astype(np.float64)
+    points, top = samples.position.astype(float), samples.normal[:, 2] < -0.9
+    across, normals = np.ptp(points[:, 2]), samples.normal[top].astype(float)
     beneath = points[top] + np.array([0.0, 0.0, 0.8 * across])
     # of all samples and not of facing ones alone, the nearest are those of the other side
     _, by_place, _ = samples.planes(beneath, Directions(signed, normals, 0.0))

@@ -25,9 +25,11 @@ SEEN = replace(SMALL, observations=("all",))
 TOY = toy_scene()
 SEED, EXAMPLES = 3, 5
 
+Folders = tuple[Path, Path]
+
 
 @pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+def data(tmp_path_factory: pytest.TempPathFactory) -> Folders:
     """The same examples without and with further observations."""
     with pytest.MonkeyPatch.context() as patch:
         make_small_datasets(patch)
@@ -53,7 +55,7 @@ def test_all_are_those_that_differ_from_the_examples_own_sensor_and_an_unknown_o
         settings.__post_init__()
 
 
-def test_state_first_cloud_and_queries_are_those_without_and_the_manifest_has_sensors(data: tuple[Path, Path]) -> None:
+def test_state_first_cloud_and_queries_are_those_without_and_the_manifest_has_sensors(data: Folders) -> None:
     for shard in data[0].glob("shard-*"):
         plain, seen = (load_file(directory / shard.name) for directory in data)
         assert seen.keys() - plain.keys() == {"seen", "seen_count"}
@@ -71,7 +73,7 @@ def test_an_observation_is_the_same_whichever_others_there_are_and_its_size_is_k
         assert size == example_bytes(settings, len(TOY.rest.segments))
 
 
-def test_resuming_needs_the_same_observations(data: tuple[Path, Path]) -> None:
+def test_resuming_needs_the_same_observations(data: Folders) -> None:
     before = [contents(directory) for directory in data]
     for directory, right, wrong in zip(data, (SMALL, SEEN), (SEEN, SMALL), strict=True):
         generate(TOY, directory, right, examples=EXAMPLES, seed=SEED, resume=True)
@@ -80,7 +82,7 @@ def test_resuming_needs_the_same_observations(data: tuple[Path, Path]) -> None:
     assert [contents(directory) for directory in data] == before
 
 
-def test_half_precision_moves_no_point_by_more_than_its_noise(data: tuple[Path, Path]) -> None:
+def test_half_precision_moves_no_point_by_more_than_its_noise(data: Folders) -> None:
     found = example(SEEN, 0)
     stored = load_file(data[1] / "shard-00000.safetensors")
     for number, cloud in enumerate(found.observations):
@@ -91,7 +93,7 @@ def test_half_precision_moves_no_point_by_more_than_its_noise(data: tuple[Path, 
 
 
 def test_one_that_hardly_sees_the_object_is_the_first_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
-    views: list[SimulatedView] = []
+    views = []
 
     def blind(*arguments: object) -> SimulatedView:
         view = observe(*arguments)  # type: ignore[arg-type]

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -34,7 +35,7 @@ def bones(require_asset: Require) -> None:
 
 
 def test_repair_keeps_the_largest_piece_and_closes_its_hole() -> None:
-    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], dtype=float)
+    cube = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4)]  # one side is missing
     faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
     stray = np.array([[0, 8, 9]])  # shares a vertex, but no edge
@@ -63,7 +64,7 @@ def test_the_repaired_liver_is_the_known_one() -> None:
 # --- skull ------------------------------------------------------------------------------------------------------------
 
 
-def signed(solids: Solids, index: int, points: np.ndarray) -> np.ndarray:
+def signed(solids: Solids, index: int, points: ndarray) -> ndarray:
     return np.where(solids.inside(index, points), -1, 1) * solids.segment_distance(index, points)
 
 

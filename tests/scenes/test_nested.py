@@ -1,9 +1,12 @@
 """A segment inside a segment: every rule of docs/method.md, on balls whose answers are in closed form."""
 
+from math import pi
+
 import numpy as np
 import pytest
 from analytic import ball as distance_to_ball
 from analytic import logits_of
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
@@ -13,7 +16,8 @@ from shapes import ball, box
 from toy_scene import Shear
 
 from mereo.deformation.maps import Deformation
-from mereo.geometry.mesh import SegmentedMesh
+from mereo.geometry.conventions import Triple
+from mereo.geometry.mesh import Nested, SegmentedMesh
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import Solids, signed_distance_and_direction
 from mereo.geometry.transforms import transform_points, unit_rows
@@ -29,7 +33,7 @@ CORE, ORGAN = ((2.0, 0.0, 0.0), 2.6), ((0.0, 0.0, 0.0), 5.0)
 """Centre and radius; the core comes as near as 0.4 to the organ's surface."""
 
 
-def organ(nested: tuple[tuple[str, str], ...] = (("core", "organ"),)) -> SegmentedMesh:
+def organ(nested: Nested = (("core", "organ"),)) -> SegmentedMesh:
     return SegmentedMesh((ball(*CORE, "core", 0), ball(*ORGAN, "organ", 1)), nested)
 
 
@@ -38,16 +42,16 @@ def onion() -> SegmentedMesh:
     return SegmentedMesh(tuple(balls), (("a", "b"), ("b", "c")))
 
 
-def radius(points: np.ndarray, part: tuple[tuple[float, float, float], float]) -> np.ndarray:
+def radius(points: ndarray, part: tuple[Triple, float]) -> ndarray:
     return norm(points - part[0], axis=1)
 
 
-def clear_of(points: np.ndarray, gap: float) -> np.ndarray:
+def clear_of(points: ndarray, gap: float) -> ndarray:
     """Which points are farther from both surfaces; facets deviate from balls by up to 0.01."""
     return (np.abs(radius(points, CORE) - CORE[1]) > gap) & (np.abs(radius(points, ORGAN) - ORGAN[1]) > gap)
 
 
-def true_labels(points: np.ndarray) -> np.ndarray:
+def true_labels(points: ndarray) -> ndarray:
     """1 in the core, 2 in the rest of the organ."""
     return np.where(radius(points, CORE) < CORE[1], 1, np.where(radius(points, ORGAN) < ORGAN[1], 2, 0))
 
@@ -56,7 +60,7 @@ def test_what_is_nested_in_a_nested_segment_is_nested_too_and_owns_its_shell() -
     assert onion().nesting == ((0, 1), (0, 2), (1, 2)) and organ(()).nesting == ()
     meshes = np.array([segment.volume for segment in onion().segments])
     assert_allclose(onion().owned_volumes, np.diff(meshes, prepend=0.0))
-    assert_allclose(onion().owned_volumes / (4 / 3 * np.pi), [1, 7, 19], rtol=0.01)
+    assert_allclose(onion().owned_volumes / (4 / 3 * pi), [1, 7, 19], rtol=0.01)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +144,7 @@ def test_every_sampler_gives_points_to_their_owner(sampler: str) -> None:
 
 
 @pytest.mark.parametrize("nested", [(), (("core", "organ"),)])
-def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tuple[tuple[str, str], ...]) -> None:
+def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: Nested) -> None:
     # off the grid: a node exactly on both surfaces would be as likely empty
     core, whole = distance_to_ball((0.313, 0.107, -0.211), 0.45), distance_to_ball((0, 0, 0), 1.0)
     field = logits_of(core, lambda points: np.maximum(whole(points), -core(points)))
@@ -156,8 +160,8 @@ def test_a_declared_outer_surface_leaves_out_the_wall_of_the_cavity(nested: tupl
     spheres = 1 if nested else 2  # that bound the organ's mesh
     assert [len(part.vertices) - len(part.faces) // 2 for part in (inner, outer)] == [2, 2 * spheres]
     volumes = found.surfaces.owned_volumes
-    assert volumes[0] == pytest.approx(4 / 3 * np.pi * 0.45**3, rel=0.02)
-    assert volumes.sum() == pytest.approx(4 / 3 * np.pi, rel=0.01)
+    assert volumes[0] == pytest.approx(4 / 3 * pi * 0.45**3, rel=0.02)
+    assert volumes.sum() == pytest.approx(4 / 3 * pi, rel=0.01)
     apart = cKDTree(outer.vertices).query(inner.vertices)[0].max()  # marching cubes is in single precision
     assert apart > 0.1 if nested else apart < 1e-5
 

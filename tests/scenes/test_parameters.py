@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy import ndarray
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.stats import kstest
@@ -11,6 +12,7 @@ from toy_scene import rest_mesh, toy_scene
 
 from mereo.deformation.draw_names import DrawName, named, part
 from mereo.deformation.maps import Deformation, Rigid
+from mereo.geometry.conventions import WholeNumbers
 from mereo.scenes.draw_recorder import Recorder
 from mereo.scenes.parameters import (
     Parameter,
@@ -43,7 +45,7 @@ def slider(played: Played, name: str) -> Parameter:
     return next(parameter for parameter in parameters(played) if parameter.name == name)
 
 
-def shift_of(played: Played) -> np.ndarray:
+def shift_of(played: Played) -> ndarray:
     return played.deformations[0](np.zeros((1, 3)))[0]
 
 
@@ -257,7 +259,7 @@ def test_draws_keep_their_values_with_their_names() -> None:
         assert_array_equal(shift_of(played), before)
 
 
-def places(scene: Scene, played: Played) -> np.ndarray:
+def places(scene: Scene, played: Played) -> ndarray:
     return scene.deform(played.deformations).mesh.merged()[0]
 
 
@@ -284,6 +286,6 @@ def test_every_number_has_the_name_of_its_slider_and_those_of_one_are_counted() 
 
 
 @pytest.mark.parametrize("sizes", [(3,), (3, 2), (4, 1), ()])
-def test_other_draws_than_the_scene_makes_are_refused(sizes: tuple[int, ...]) -> None:
+def test_other_draws_than_the_scene_makes_are_refused(sizes: WholeNumbers) -> None:
     with pytest.raises(Refused, match=f"the scene 'toy' does not take these {len(sizes)} draws; .* register the frame"):
         played_back(toy_scene(), 0, [np.full(size, 0.5) for size in sizes])

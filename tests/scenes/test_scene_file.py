@@ -8,6 +8,7 @@ from typing import get_args
 import numpy as np
 import pytest
 import trimesh
+from folder_contents import run_mereo
 from label_cases import halves, write_nifti
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -16,9 +17,9 @@ from scene_code import CODE, EVERYTHING
 from scene_files import HEAD, write_bar, write_mesh
 from shapes import ball, box, write_model
 
-import mereo.__main__ as command_line
 from mereo.deformation.maps import jacobian_determinant
 from mereo.deformation.samplers import RandomMotion
+from mereo.geometry.conventions import Names, WholeNumbers
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.scenes.files import build, check
 from mereo.scenes.files.deformation_blocks import AnyDeformation, CameraBlock, SceneFile
@@ -47,7 +48,7 @@ def test_the_scene_has_the_files_segments_in_scene_units(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("sides", [(20, 10, 10), (20, 4, 1)])
-def test_segments_that_do_not_touch_bend_as_much_as_they_should_in_a_box_of_rubber(sides: tuple[int, ...]) -> None:
+def test_segments_that_do_not_touch_bend_as_much_as_they_should_in_a_box_of_rubber(sides: WholeNumbers) -> None:
     apart = SegmentedMesh((box((0, 0, 0), sides, "left", 0), box((30, 0, 0), np.add(sides, [30, 0, 0]), "right", 1)))
     blocks = default_deformations(apart)
     assert [block.type for block in blocks] == ["bend", "lattice", "lattice"]
@@ -169,7 +170,7 @@ def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> Non
         ("type: lattice", "{type: push, distance: [0, 5], tip: 1, reach: 6}", 11, ("reach must be above 10.8",)),
     ],
 )
-def test_errors_name_line_value_and_cure(old: str, new: str, line: int, parts: tuple[str, ...], tmp_path: Path) -> None:
+def test_errors_name_line_value_and_cure(old: str, new: str, line: int, parts: Names, tmp_path: Path) -> None:
     tail = "size: 20\ndeformations:\n  - type: lattice\n  - type: bend\n    origin: [100, 5, 5]\n    axis: [1, 0, 0]\n"
     head = HEAD + tail + "    length: 40\n    angle: [0, 100]\n"
     load_scene(write_bar(tmp_path, head=head))
@@ -331,14 +332,14 @@ def test_the_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
     monkeypatch.setattr(check, "STATES", 3)
     write_mesh(ball((0, 0, 0), 30.0), tmp_path / "a.ply")
     monkeypatch.chdir(tmp_path)
-    assert command_line.main(["scene", "new", "a.ply", "--units", "cm"]) == 0
+    assert run_mereo("scene", "new", "a.ply", "--units", "cm") == 0
     assert "units: cm  # as you said" in (tmp_path / "a.yaml").read_text()
     assert "wrote a.yaml" in capsys.readouterr().out
-    assert command_line.main(["scene", "new", "a.ply", "--output", "b b.yaml", "--aperture", "90"]) == 0
+    assert run_mereo("scene", "new", "a.ply", "--output", "b b.yaml", "--aperture", "90") == 0
     assert "aperture: 90 " in (tmp_path / "b b.yaml").read_text()
     assert "mereo scene check 'b b.yaml'" in capsys.readouterr().out
-    assert command_line.main(["scene", "new", "a.ply", "--output", "c.yaml", "--aperture", "400"]) == 2
+    assert run_mereo("scene", "new", "a.ply", "--output", "c.yaml", "--aperture", "400") == 2
     assert "--aperture is 400" in capsys.readouterr().err and not (tmp_path / "c.yaml").exists()
-    assert command_line.main(["scene", "check", "a.yaml"]) == 0
+    assert run_mereo("scene", "check", "a.yaml") == 0
     assert "a: 1 segments, closed" in capsys.readouterr().out
-    assert command_line.main(["scene", "preview", "a.yaml", "--output", "a.png"]) == 0
+    assert run_mereo("scene", "preview", "a.yaml", "--output", "a.png") == 0

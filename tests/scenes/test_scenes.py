@@ -5,6 +5,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from numpy import ndarray
 from numpy.linalg import det, norm
 from numpy.random import Generator, default_rng
 from overlapping import check_overlap
@@ -13,7 +14,7 @@ from solid_pairs import crowded
 
 from mereo.deformation.maps import invert, jacobian_determinant
 from mereo.geometry.camera import Camera
-from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.conventions import MIN_POINTS, Range
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, is_rigid, look_at, transform_points
@@ -57,7 +58,7 @@ def states(scene: Scene) -> list[State]:
     return [scene.sample_state(rng) for _ in range(STATES)]
 
 
-def interior_points(scene: Scene, rng: Generator, count: int = 300) -> list[np.ndarray]:
+def interior_points(scene: Scene, rng: Generator, count: int = 300) -> list[ndarray]:
     solids, points = Solids(scene.rest), []
     for index, segment in enumerate(scene.rest.segments):
         draws = rng.uniform(*segment.bounds, size=(4000, 3))
@@ -65,9 +66,9 @@ def interior_points(scene: Scene, rng: Generator, count: int = 300) -> list[np.n
     return points
 
 
-def smallest_determinant(state: State, points: list[np.ndarray]) -> float:
+def smallest_determinant(state: State, points: list[ndarray]) -> float:
     """Over points of all segments, the segments that one map moves together."""
-    groups: dict[int, list[np.ndarray]] = {}
+    groups = {}
     for deformation, part in zip(state.deformations, points, strict=True):
         groups.setdefault(id(deformation), []).append(part)
     maps = {id(deformation): deformation for deformation in state.deformations}
@@ -117,7 +118,7 @@ def test_touching_segments_keep_touching(scene: Scene, states: list[State]) -> N
             continue  # they touch by chance, and each bends alone
         pairs = [(i, j) for i, near in enumerate(trees[a].query_ball_tree(trees[b], 1e-5)) for j in near]
         shared += len(pairs)
-        i, j = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+        i, j = np.array(pairs, np.int64).reshape(-1, 2).T
         for state in states:
             moved = state.mesh.segments[a].vertices[i] - state.mesh.segments[b].vertices[j]
             assert np.abs(moved).max(initial=0.0) < NOISE / 2
@@ -127,9 +128,7 @@ def test_touching_segments_keep_touching(scene: Scene, states: list[State]) -> N
 @pytest.mark.parametrize(
     ("count", "volumes"), [(STATES, (0.65, 1.6)), pytest.param(MANY_STATES, (0.4, 2.0), marks=pytest.mark.slow)]
 )
-def test_random_states_are_sound_apart_smooth_and_in_view(
-    scene: Scene, count: int, volumes: tuple[float, float]
-) -> None:
+def test_random_states_are_sound_apart_smooth_and_in_view(scene: Scene, count: int, volumes: Range) -> None:
     rng, size = default_rng(8), GenerateConfig().image_size
     inner = interior_points(scene, rng, 100)
     vertices = [rng.permutation(segment.vertices)[:300] for segment in scene.rest.segments]

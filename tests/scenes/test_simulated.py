@@ -8,6 +8,7 @@ import pytest
 import trimesh
 from analytic import untrained
 from lattice import SIZE, boxes, lattice, pvd_text, states
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
@@ -110,7 +111,7 @@ def test_the_interior_estimate_is_near_the_solid_that_made_the_surface() -> None
 def test_only_test_seeds_take_held_out_states_which_are_of_the_same_object(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shards, "rest_distances", lambda rest: np.zeros((4, 2, 2, 2), dtype=np.float16))  # slow
+    monkeypatch.setattr(shards, "rest_distances", lambda rest: np.zeros((4, 2, 2, 2), np.float16))  # slow
 
     def forbidden(rng: Generator) -> tuple:
         raise AssertionError("drawn from the wrong states")
@@ -135,7 +136,7 @@ def test_only_test_seeds_take_held_out_states_which_are_of_the_same_object(
 FRAMES = 10
 
 
-def frame(vertices: np.ndarray, number: int) -> np.ndarray:
+def frame(vertices: ndarray, number: int) -> ndarray:
     """Millimetres: the bar bows sideways, by more with every frame."""
     along = (vertices[:, 0] - 120) / 20
     return vertices + np.outer(1 - along**2, [0, 0.3 * number, 0])

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import untrained
+from folder_contents import run_mereo
 from numpy.testing import assert_allclose
 
-from mereo import __main__ as command_line
 from mereo.cli.scenes import SceneModes
 from mereo.deformation.maps import Identity
 from mereo.models.weights import save_model
@@ -49,7 +49,7 @@ def test_a_model_survives_its_file_up_to_rounding(rope: StatisticalModel, tmp_pa
 def test_what_fewer_modes_leave_out_is_residue(rope: StatisticalModel) -> None:
     few = with_fewer_modes(rope, 5)
     assert few.count == 5 and with_fewer_modes(rope, 1000) is rope
-    lost = (rope.modes[..., 5:].astype(np.float64) ** 2).sum() / len(rope.mean)
+    lost = (rope.modes[..., 5:].astype(float) ** 2).sum() / len(rope.mean)
     assert few.residue**2 == pytest.approx(rope.residue**2 + lost)
     for count in (0, 1, rope.count // 2, rope.count):
         assert rope.residues[count] == pytest.approx(with_fewer_modes(rope, count).residue, rel=1e-6)
@@ -87,7 +87,7 @@ def test_the_number_of_modes_needed_is_the_smallest_that_is_enough(rope: Statist
 def test_the_command_says_how_many_also_of_weights(
     rope: StatisticalModel, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    assert command_line.main(["scene", "modes", "rope", "--states", "100"]) == 0
+    assert run_mereo("scene", "modes", "rope", "--states", "100") == 0
     assert "modes leave" in capsys.readouterr().out
     with pytest.raises(ValueError, match="fewer than 100 say little"):
         SceneModes("rope", states=5).run()

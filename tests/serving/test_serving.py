@@ -23,7 +23,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy import ndarray
+from numpy.random import default_rng
 from numpy.testing import assert_allclose
+
+from mereo.io.atomic_files import JsonObject
 
 pytest.importorskip("fastapi", reason="fastapi (extra `serve`) is not installed")
 pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`) is not installed")
@@ -75,15 +79,15 @@ def balls(_: object = None, __: InferenceConfig | None = None) -> Model:
     return replace(AnalyticModel.of(field, NAMES, normalized=True), provenance={})
 
 
-def npy(points: np.ndarray = CLOUD) -> bytes:
+def npy(points: ndarray = CLOUD) -> bytes:
     file = io.BytesIO()
     np.save(file, points)
     return file.getvalue()
 
 
-def figures(answer: httpx2.Response | bytes) -> dict[str, Any]:
+def figures(answer: httpx2.Response | bytes) -> JsonObject:
     """What of an answer no clock decides."""
-    found: dict[str, Any] = json.loads(answer if isinstance(answer, bytes) else answer.content)
+    found = json.loads(answer if isinstance(answer, bytes) else answer.content)
     found.get("registration", {}).pop("seconds", None)
     return {key: value for key, value in found.items() if key != "timings_s"}
 
@@ -95,7 +99,7 @@ class ThreadWorker(WorkerProcess):
         self.answerer, self.ready = answerer, answerer.ready()
         self.go, self.begun, self.restarts, self.asked = threading.Event(), threading.Event(), 0, list[FrameRequest]()
         self.go.set()
-        self.dies: Callable[[FrameRequest], bool] = lambda frame: False
+        self.dies = lambda frame: False
 
     def ask(self, frame: FrameRequest) -> Reply:
         self.asked.append(frame)
@@ -241,9 +245,9 @@ async def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model,
         assert again.content == alone.save(tmp_path / "segments.glb").read_bytes()
 
 
-def clouds(count: int) -> Iterator[np.ndarray]:
+def clouds(count: int) -> Iterator[ndarray]:
     for number in range(count):
-        rng = np.random.default_rng(number)
+        rng = default_rng(number)
         kept = np.sort(rng.choice(len(CLOUD), 700 + 20 * number, replace=False))
         yield CLOUD[kept] * (1 + 0.1 * number) + [0.01 * number, 0.0, 0.02 * number]
 
@@ -304,7 +308,7 @@ async def test_numbers_for_prometheus_count(tmp_path: Path) -> None:
 # --- the queue: bounded, fair to clients that leave, whole when a process dies or it ends -----------------------------
 
 
-def moved(metres: float) -> np.ndarray:
+def moved(metres: float) -> ndarray:
     return CLOUD + np.array([0.0, 0.0, metres])
 
 
@@ -362,13 +366,13 @@ async def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> Non
         told, statuses = asyncio.Event(), list[int | None]()
         messages = iter([{"type": "http.request", "body": npy(), "more_body": False}])
 
-        async def receive() -> dict[str, Any]:
+        async def receive() -> JsonObject:
             for message in messages:
                 return message
             await told.wait()
             return {"type": "http.disconnect"}
 
-        async def send(message: dict[str, Any]) -> None:
+        async def send(message: JsonObject) -> None:
             statuses.append(message.get("status"))
 
         headers = [(b"host", b"localhost"), (b"content-type", b"application/x-npy")]
@@ -558,15 +562,15 @@ FORM = {"Content-Type": "multipart/form-data; boundary=b"}
 LONG = {"Content-Type": f"multipart/form-data; boundary={'b' * 5000}"}
 
 
-def form(**parts: Any) -> dict[str, Any]:
+def form(**parts: Any) -> JsonObject:
     return {"files": {"frame": ("a.npy", npy()), **parts}}
 
 
-def asked(query: str, **request: Any) -> dict[str, Any]:
+def asked(query: str, **request: Any) -> JsonObject:
     return {"address": f"{ADDRESS}?{query}", **(request or {"content": npy()})}
 
 
-REFUSED: dict[str, tuple[int, str, dict[str, Any]]] = {
+REFUSED = {
     "a damaged cloud": (422, "frame.ply cannot be read as a point cloud (", {"content": b"x", "headers": PLY}),
     "too few points": (422, "the cloud has 3 points", {"content": b"0 0 1\n1 0 1\n0 1 1\n", "headers": TEXT}),
     "missing points": (422, "leave them out with --drop-invalid", {"content": npy(HOLES)}),

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
 
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.problem.correspondences import Correspondences
@@ -19,7 +20,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 
 def answer_to(
-    points: PointCloud | np.ndarray,
+    points: PointCloud | ndarray,
     model: Model,
     registrar: Registrar | None = None,
     resolution: int = 128,
@@ -28,12 +29,12 @@ def answer_to(
     **options: Any,
 ) -> Answer:
     """Answer to a cloud that is all the object's; without a registrar the network's."""
-    cloud = points if isinstance(points, PointCloud) else PointCloud(np.asarray(points, dtype=np.float64))
+    cloud = points if isinstance(points, PointCloud) else PointCloud(np.asarray(points, float))
     return answer_frame(observe(cloud, axes, unit_m), model, registrar, resolution=resolution, **options)
 
 
 def reconstruct(
-    points: PointCloud | np.ndarray,
+    points: PointCloud | ndarray,
     model: Model,
     resolution: int = 128,
     axes: CloudAxes = "camera",
@@ -46,7 +47,7 @@ def reconstruct(
 
 
 def fit_correspondences(
-    points: np.ndarray,
+    points: ndarray,
     correspondences: Correspondences,
     model: StatisticalModel,
     scene_unit: float | None = None,

@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+from mereo.geometry.conventions import Names, Pair, WholeNumbers
+
 MODULE_NAME = re.compile(r"\w+\.[\w.]*")
 
 
@@ -163,13 +165,13 @@ def upward_imports(package: Package) -> list[str]:
     return [f"{i.place} imports {i.target.replace('/', '.')}, {rules['/' in i.target]}" for i in upward]
 
 
-def _height(module: str) -> tuple[int, int]:
+def _height(module: str) -> Pair:
     """Place of the module's room in ``ROOMS``, then of its sub-room; what lies in none of them comes after all."""
     room, inside, *_ = *module.split("/"), ""
     return _place(room, ROOMS), _place(inside, SUBROOMS.get(room, ()))
 
 
-def _place(name: str, order: tuple[str, ...]) -> int:
+def _place(name: str, order: Names) -> int:
     return order.index(name) if name in order else len(order)
 
 
@@ -247,7 +249,7 @@ def constants(tree: ast.Module) -> int:
     return sum(isinstance(value, int | float) and not isinstance(value, bool) for value in literals)
 
 
-def over_budget(top: Path, budget: Mapping[str, tuple[int, ...]], units: Mapping[str, Count | None]) -> list[str]:
+def over_budget(top: Path, budget: Mapping[str, WholeNumbers], units: Mapping[str, Count | None]) -> list[str]:
     """Folders of ``top`` whose Python has more of these units than the folder may have; None counts files."""
     faults = list[str]()
     for folder, most in budget.items():
@@ -259,10 +261,10 @@ def over_budget(top: Path, budget: Mapping[str, tuple[int, ...]], units: Mapping
     return faults
 
 
-SIZE: Mapping[str, Count | None] = {"syntax nodes": syntax_nodes, "files": None}
+SIZE = {"syntax nodes": syntax_nodes, "files": None}
 """Units of ``BUDGET``."""
 
-COMPLEXITY: Mapping[str, Count | None] = {"decisions": decisions, "constants": constants}
+COMPLEXITY = {"decisions": decisions, "constants": constants}
 """Units of ``CHOICES``."""
 
 

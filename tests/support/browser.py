@@ -13,8 +13,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy import ndarray
 from numpy.linalg import norm
 from PIL import Image
+
+from mereo.geometry.conventions import Pair
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 
@@ -32,7 +35,7 @@ OPTIONS = (
 class Page:
     """One page in a browser of its own; a context manager."""
 
-    def __init__(self, folder: Path, address: str, size: tuple[int, int] = (1200, 800)) -> None:
+    def __init__(self, folder: Path, address: str, size: Pair = (1200, 800)) -> None:
         assert BROWSER
         from websockets.sync.client import connect
 
@@ -78,7 +81,7 @@ class Page:
     def text(self) -> str:
         return str(self.evaluate("document.body.innerText"))
 
-    def screenshot(self) -> np.ndarray:
+    def screenshot(self) -> ndarray:
         data = base64.b64decode(self.call("Page.captureScreenshot", format="png")["data"])
         return np.asarray(Image.open(io.BytesIO(data)).convert("RGB"))
 
@@ -99,9 +102,9 @@ def until(condition: Callable[[], Any], timeout_s: float = 120.0) -> Any:
     return found
 
 
-def pixels_of(picture: np.ndarray, color: tuple[int, int, int], cosine: float = 0.99) -> int:
+def pixels_of(picture: ndarray, color: tuple[int, int, int], cosine: float = 0.99) -> int:
     """How many pixels have this hue, whatever the light."""
-    wanted, shown = np.asarray(color, dtype=float), picture.astype(float)
+    wanted, shown = np.asarray(color, float), picture.astype(float)
     length = norm(shown, axis=-1)
     same = shown @ wanted / (np.maximum(length, 1e-9) * norm(wanted)) > cosine
     return int((same & (length > 60)).sum())

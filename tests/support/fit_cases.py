@@ -1,6 +1,8 @@
 """A scene with a deformation model, its random states, and frames of them as a fit gets them."""
 
 import numpy as np
+from numpy import ndarray
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
@@ -21,27 +23,27 @@ IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matri
 """``T_camera_world`` of an object around the world's origin."""
 
 
-def said(model: StatisticalModel, material: np.ndarray, error: float = 0.5) -> Correspondences:
+def said(model: StatisticalModel, material: ndarray, error: float = 0.5) -> Correspondences:
     """What a network might say of a state: 200 material points, wrong by ``error`` units."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     chosen = rng.choice(len(model.labels), 200, replace=False)
     rest = model.rest_points[chosen] + rng.normal(scale=error, size=(200, 3))
     return Correspondences(material[chosen], rest, model.labels[chosen], np.ones(200), np.arange(200) < 100)
 
 
-def seen(mesh: SegmentedMesh) -> np.ndarray:
+def seen(mesh: SegmentedMesh) -> ndarray:
     """Cloud of a noiseless depth image, from the origin along z."""
     return render_depth(mesh, Camera.from_fov(128, 128, 0.6)).to_points().points
 
 
-def true_material(model: StatisticalModel, view: View) -> np.ndarray:
+def true_material(model: StatisticalModel, view: View) -> ndarray:
     """Material points of a view's state, camera frame."""
     state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
     points = state_points(state, model.nodes, model.node_labels)
     return transform_points(inverse_rigid(view.T_world_camera), points)
 
 
-def shown(model: StatisticalModel, excess: float) -> tuple[np.ndarray, np.ndarray]:
+def shown(model: StatisticalModel, excess: float) -> tuple[ndarray, ndarray]:
     """Cloud and material points of a state whose draws are ``excess`` times the scene's bounds, camera frame."""
     shear = Shear(3.0 * excess, 0.3 * excess, 0.2 * excess)
     state = SCENE.deform((shear, shear, shear, Lift(1.0, shear)))

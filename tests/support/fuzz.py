@@ -36,6 +36,7 @@ import trimesh
 import yaml
 from camera_files import write_camera
 from lattice import pvd_text, xdmf_text
+from numpy import ndarray
 from numpy.random import default_rng
 from PIL import Image
 from point_files import save_pcd, save_ply
@@ -48,6 +49,7 @@ from toy_scene import toy_scene
 from written_results import COLORS, cloud, grid, segments
 
 from mereo.geometry.camera import Camera
+from mereo.geometry.conventions import Pair
 from mereo.io.atomic_files import check_new_directory, new_directory, write_json
 from mereo.io.attachments import read_attachments, read_pose_table
 from mereo.io.config import InputConfig
@@ -111,7 +113,7 @@ def limits(seconds: float = 60.0, gigabytes: float = 2.0) -> Iterator[None]:
 
 def fault_of(read: Callable[[Path], object], path: Path) -> tuple[bool, str]:
     """Whether an input was taken, and how that broke the rule; a refusal may name the folder of the input instead."""
-    error: BaseException | None = None
+    error = None
     before = listing(path.parent)
     with warnings.catch_warnings(record=True) as warned:
         warnings.simplefilter("always")
@@ -140,7 +142,7 @@ def fault_of(read: Callable[[Path], object], path: Path) -> tuple[bool, str]:
     return error is None, f"{'; '.join(broken)}: {error!r}" if broken else ""
 
 
-def listing(folder: Path) -> dict[str, tuple[int, int]]:
+def listing(folder: Path) -> dict[str, Pair]:
     """Files of a folder, with what changes when they do."""
     found = {str(path.relative_to(folder)): path.stat() for path in folder.rglob("*")}
     return {name: (stat.st_size, stat.st_mtime_ns) for name, stat in found.items()}
@@ -154,7 +156,7 @@ PIECES = (
     *(b"1" + b"0" * 40, b"1e999", b"nan", b"0x10", b"1,5", b"\n", b"\xef\xbb\xbf", b"\x1b[31m", b'"', b"{", b"]", b":"),
     *(b"&a", b"*a", b"!!binary ", b"../..", b"\xed\xa0\x80", "\u2028".encode(), b"%s", b"null", b"#", b","),
 )
-VALUES: tuple[Any, ...] = (
+VALUES = (
     *(None, True, 0, -1, 255, 2**31, 2**63, 10**30, 0.5, 1e308, math.nan, math.inf, "", "a", "\n", "\x1b[31m"),
     *("\ud800", "../..", "a" * 5000, [], {}, [[]], [None], [0] * 4, [1e308] * 3, {"a": 1}, {"": None}),
     list(range(300)),
@@ -281,11 +283,11 @@ def rows(mark: str, head: str) -> Write:
     return text(head + "".join(mark.join(map(str, row)) + "\n" for row in POINTS.tolist()))
 
 
-def write_cloud(save: Callable[[np.ndarray, str], bytes], layout: str, path: Path) -> None:
+def write_cloud(save: Callable[[ndarray, str], bytes], layout: str, path: Path) -> None:
     path.write_bytes(save(POINTS.astype(np.float32), layout))
 
 
-def image(values: np.ndarray, **options: Any) -> Write:
+def image(values: ndarray, **options: Any) -> Write:
     def write(path: Path) -> None:
         write_camera(path.with_name("camera.json"), CAMERA)
         if path.suffix == ".npy":
@@ -329,7 +331,7 @@ def zdf(path: Path) -> None:
 
 def exported(suffix: str) -> Write:
     part = ball((4, 0, 0), 1.0, "b", level=1)
-    mesh: Any = trimesh.Trimesh(part.vertices, part.faces, process=False)
+    mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
 
     def write(path: Path) -> None:
         whole = trimesh.Scene({"a": mesh, "b": mesh.copy()}) if suffix in ("3mf", "glb") else mesh
@@ -465,7 +467,7 @@ class Target(NamedTuple):
     library: str = "numpy"
 
 
-ALL: dict[str, Target] = {
+ALL = {
     "ascii.ply": Target(partial(write_cloud, save_ply, "ascii"), exactly_read),
     "labelled.ply": Target(lambda p: write_points_ply(p, cloud()), exactly_read),
     **{f"{kind}.pcd": Target(partial(write_cloud, save_pcd, kind), exactly_read) for kind in PCD},

@@ -30,26 +30,28 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from folder_contents import read_json
 from golden_objects import FOLDER, OWN, weights_of
+from numpy import ndarray
 from numpy.linalg import norm
+from numpy.random import default_rng
 
 import mereo
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
 from mereo.geometry.transforms import fit_rigid
+from mereo.io.atomic_files import JsonObject
 from mereo.models.weights_place import shipped_names
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
-from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
+from mereo.synthesis.config import SENSORS, GenerateConfig
 from mereo.synthesis.examples import sample_view
 from mereo_learning.scans import SCANS, bunny_posed
 
 SEED, VIEWS = 1000, 4
-CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "time-of-flight")
+CAMERAS = ("paper", "structured-light", "time-of-flight")
 OBJECTS = (*shipped_names(), *OWN, "scans")
 RESOLUTION, CELLS, POSITIONS = 48, 60, 64
 
@@ -70,7 +72,7 @@ paths is allowed: the next processor may go farther than the few that were tried
 class Frame:
     """Points that are answered, with their truth; ``unit_m`` is None where the answer has to find it."""
 
-    points: np.ndarray
+    points: ndarray
     truth: SegmentedMesh
     axes: str = "camera"
     unit_m: float | None = None
@@ -105,7 +107,7 @@ def object_of(name: str) -> mereo.Object:
     return mereo.load_object(weights, scene, device="cpu", precision="float32")
 
 
-def facts_of(name: str, frame: Frame) -> dict[str, Any]:
+def facts_of(name: str, frame: Frame) -> JsonObject:
     found = mereo.reconstruct(
         frame.points, object_of(name), resolution=RESOLUTION, axes=frame.axes, unit_m=frame.unit_m
     )
@@ -115,7 +117,7 @@ def facts_of(name: str, frame: Frame) -> dict[str, Any]:
     model = object_of(name).network
     assert model is not None
     scores = intersection_over_union(grid_confusion(grid, labels, len(model.names)), model.segmented)
-    facts: dict[str, Any] = {
+    facts = {
         "answer": "network" if not found.taken or registration is None else registration.method,
         "iou": round(scores.iou, 4),
         "miou": round(scores.miou, 4),
@@ -150,12 +152,16 @@ def significant(value: float) -> float:
     return float(f"{value:.6g}")
 
 
-def digest(*arrays: np.ndarray) -> str:
+def digest(*arrays: ndarray) -> str:
     """Short digest of the exact values."""
     return hashlib.sha256(b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)).hexdigest()[:12]
 
 
-def answers_of(name: str) -> dict[str, dict[str, Any]]:
+Answers = dict[str, JsonObject]
+"""Facts of the answers to an object's frames, by the frames' names."""
+
+
+def answers_of(name: str) -> Answers:
     import torch
 
     torch.set_num_threads(1)
@@ -165,11 +171,11 @@ def answers_of(name: str) -> dict[str, dict[str, Any]]:
 # --- comparison -------------------------------------------------------------------------------------------------------
 
 
-def change(fact: str, kept: dict[str, Any], now: dict[str, Any]) -> float:
+def change(fact: str, kept: JsonObject, now: JsonObject) -> float:
     """How far a number is from the kept one: relative for lengths and radii, in object sizes for positions."""
     if fact == "positions":
         return float(norm(np.asarray(now[fact]) - kept[fact], axis=1).max() / kept["size"])
-    before, after = (np.asarray(facts.get(fact) or 0.0, dtype=float) for facts in (kept, now))
+    before, after = (np.asarray(facts.get(fact) or 0.0, float) for facts in (kept, now))
     return float((abs(after - before) / (abs(before) if fact in ("scene_unit", "radius95") else 1.0)).max())
 
 
@@ -183,7 +189,7 @@ ROUNDING = 1e-3
 """What every number may differ by: scores are kept with four digits, shares are of a few hundred points."""
 
 
-def difference(kept: dict[str, Any], now: dict[str, Any]) -> str | None:
+def difference(kept: JsonObject, now: JsonObject) -> str | None:
     """How an answer differs from the kept one beyond the precision of other processors; None where it does not."""
     for fact in ("answer", "known", "believed", "unit_known"):
         if kept.get(fact) != now.get(fact):
@@ -199,7 +205,7 @@ def difference(kept: dict[str, Any], now: dict[str, Any]) -> str | None:
 def last_bits_of(name: str, trials: int = TRIALS) -> dict[str, float]:
     """Largest change of each number of an object's firm answer in some trials, and in those that were kept."""
     (frame,) = (frame for frame_name, frame in frames_of(name) if frame_name == FIRM[name])
-    kept, rng = kept_of(name)[FIRM[name]], np.random.default_rng()
+    kept, rng = kept_of(name)[FIRM[name]], default_rng()
     most = dict.fromkeys(NEAR, 0.0) | kept.get("last_bits", {})
     for trial in range(trials):
         moved = frame.points * (1.0 + min(trial, 1) * LAST_BIT * rng.standard_normal(frame.points.shape))
@@ -210,19 +216,19 @@ def last_bits_of(name: str, trials: int = TRIALS) -> dict[str, float]:
     return most
 
 
-def mean_score(answers: dict[str, dict[str, Any]], score: str) -> float:
+def mean_score(answers: Answers, score: str) -> float:
     return float(np.mean([facts[score] for facts in answers.values()]))
 
 
-def is_same(kept: dict[str, Any], now: dict[str, Any]) -> bool:
+def is_same(kept: JsonObject, now: JsonObject) -> bool:
     return all(kept.get(fact) == now.get(fact) for fact in ("surfaces", "material"))
 
 
-def kept_of(name: str) -> dict[str, dict[str, Any]]:
+def kept_of(name: str) -> Answers:
     return read_json(FOLDER / f"{name}.json")
 
 
-def write(name: str, answers: dict[str, dict[str, Any]]) -> None:
+def write(name: str, answers: Answers) -> None:
     lines = ",\n".join(f"{json.dumps(frame)}: {json.dumps(facts)}" for frame, facts in answers.items())
     (FOLDER / f"{name}.json").write_text(f"{{\n{lines}\n}}\n", "utf-8")
 

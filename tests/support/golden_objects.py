@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from cad_objects import write_pliers
+from trimesh.creation import icosphere
 
 FOLDER = Path(__file__).parents[1] / "golden"
 
@@ -64,12 +64,12 @@ deformations:
 def write_lump(folder: Path) -> Path:
     """Write the soft object: a lobe with a core inside and a tip that lies on it, 120 mm long."""
     folder.mkdir(parents=True, exist_ok=True)
-    lobe = trimesh.creation.icosphere(subdivisions=3)
+    lobe = icosphere(subdivisions=3)
     x, y, z = lobe.vertices.T
     lobe.vertices = np.stack([60 * x, (30 + 8 * x) * y, (22 - 6 * x) * z + 6 * x**2], axis=1)
-    core = trimesh.creation.icosphere(subdivisions=2, radius=11)
+    core = icosphere(subdivisions=2, radius=11)
     core.apply_translation((-18, 2, 0))
-    tip = trimesh.creation.icosphere(subdivisions=2)
+    tip = icosphere(subdivisions=2)
     tip.vertices = tip.vertices * (14, 16, 10) + (76, 0, 6)
     for name, mesh in (("lobe", lobe), ("core", core), ("tip", tip)):
         mesh.export(folder / f"{name}.stl")

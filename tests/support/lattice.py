@@ -3,6 +3,8 @@
 from itertools import permutations
 
 import numpy as np
+from numpy import ndarray
+from numpy.random import default_rng
 from shapes import box
 
 from mereo.deformation.tetrahedral import Tetrahedra
@@ -16,7 +18,7 @@ def lattice(jitter: float = 0.12) -> Tetrahedra:
     """Each cube as six tetrahedra (Kuhn), of both orientations; inner nodes out of line."""
     nodes = np.argwhere(np.ones(np.add(SIZE, 1))).astype(float)
     inner = ((nodes > 0) & (nodes < SIZE)).all(axis=1)
-    nodes[inner] += np.random.default_rng(0).uniform(-jitter, jitter, size=(int(inner.sum()), 3))
+    nodes[inner] += default_rng(0).uniform(-jitter, jitter, size=(int(inner.sum()), 3))
     axes = np.eye(3, dtype=int)
     steps = np.array([np.cumsum([0 * axes[0], *axes[list(order)]], axis=0) for order in permutations((0, 1, 2))])
     corners = np.argwhere(np.ones(SIZE))[:, None, None] + steps
@@ -44,7 +46,7 @@ def boxes() -> SegmentedMesh:
     return SegmentedMesh((fine(left, (2.3, 2.8, 2.8), "left", 0), fine((2.3, 0.2, 0.2), right, "right", 1)))
 
 
-def bent(points: np.ndarray, strength: float) -> np.ndarray:
+def bent(points: ndarray, strength: float) -> ndarray:
     """A smooth bend and stretch; ``strength`` up to 1 keeps the lattice's tetrahedra the right way round."""
     x, y, z = points.T
     moved = [x + 0.2 * np.sin(y), y + 0.12 * x**2, z * (1 + 0.1 * np.cos(x))]
@@ -54,7 +56,7 @@ def bent(points: np.ndarray, strength: float) -> np.ndarray:
 STRENGTHS = np.linspace(-0.9, 0.9, 10)
 
 
-def states() -> np.ndarray:
+def states() -> ndarray:
     """Node positions [10, n, 3]."""
     return np.stack([bent(lattice().nodes, strength) for strength in STRENGTHS])
 
@@ -68,10 +70,10 @@ def pvd_text(files: list[str]) -> str:
     return f'<?xml version="1.0"?><VTKFile type="Collection"><Collection>{"".join(steps)}</Collection></VTKFile>'
 
 
-def xdmf_text(nodes: np.ndarray, elements: np.ndarray, displacements: np.ndarray) -> str:
+def xdmf_text(nodes: ndarray, elements: ndarray, displacements: ndarray) -> str:
     """As dolfinx lays out a file: the mesh once, and a collection that includes it at each time step."""
 
-    def item(array: np.ndarray, kind: str) -> str:
+    def item(array: ndarray, kind: str) -> str:
         size, text = " ".join(map(str, array.shape)), " ".join(map(repr, array.ravel().tolist()))
         return f'<DataItem Dimensions="{size}" NumberType="{kind}" Precision="8" Format="XML">{text}</DataItem>'
 

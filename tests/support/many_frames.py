@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 from analytic import AnalyticModel
+from folder_contents import run_mereo
 from two_balls import scene
 
-from mereo import __main__ as command_line
 from mereo.models.config import InferenceConfig
 
 
 @pytest.fixture
 def loads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """Weights that the command has loaded; whatever they are called, they are the analytic balls."""
-    loaded: list[str] = []
+    loaded = []
 
     def load(weights: str, _: InferenceConfig) -> AnalyticModel:
         loaded.append(weights)
@@ -34,7 +34,7 @@ def frames(folder: Path, *names: str) -> Path:
 
 
 def run(*arguments: str | Path) -> int:
-    return command_line.main(["reconstruct", *map(str, arguments), "--weights", "any", "--resolution", "12"])
+    return run_mereo("reconstruct", *arguments, "--weights", "any", "--resolution", "12")
 
 
 def content(folder: Path) -> dict[str, bytes]:

@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import torch
 import trimesh
+from numpy import ndarray
+from numpy.random import default_rng
 
 from mereo.geometry.camera import PointCloud
 
-POINTS = np.random.default_rng(0).integers(1, 120, (12, 3)).astype(np.float64)
+POINTS = default_rng(0).integers(1, 120, (12, 3)).astype(float)
 """Whole numbers, which every numeric type holds exactly."""
 
 GRID = POINTS.reshape(3, 4, 3)
@@ -19,7 +21,7 @@ FIELD_CODES = {"f4": 7, "f8": 8, "i2": 3}
 """Datatypes of sensor_msgs/PointField."""
 
 
-def records(points: np.ndarray, names: str = "xyz", kind: str = "f4", skip: int = 0) -> np.ndarray:
+def records(points: ndarray, names: str = "xyz", kind: str = "f4", skip: int = 0) -> ndarray:
     """Structured array of points: ``skip`` bytes, the axes in the order of ``names``, then a colour."""
     size = np.dtype(kind).itemsize
     offsets = [skip + size * index for index in range(3)]
@@ -32,7 +34,7 @@ def records(points: np.ndarray, names: str = "xyz", kind: str = "f4", skip: int 
 
 
 def message(
-    points: np.ndarray, names: str = "xyz", kind: str = "f4", big: bool = False, skip: int = 0, padding: int = 0
+    points: ndarray, names: str = "xyz", kind: str = "f4", big: bool = False, skip: int = 0, padding: int = 0
 ) -> SimpleNamespace:
     """What a ROS message of points [n, 3] or [h, w, 3] has, with unused bytes in front of points and behind rows."""
     grid = records(points if points.ndim == 3 else points[None], names, ">"[: int(big)] + kind, skip)
@@ -48,20 +50,20 @@ def message(
     )  # fmt: skip
 
 
-def with_data(made: SimpleNamespace, convert: Callable[[np.ndarray], Any]) -> SimpleNamespace:
+def with_data(made: SimpleNamespace, convert: Callable[[ndarray], Any]) -> SimpleNamespace:
     return SimpleNamespace(**{**vars(made), "data": convert(made.data)})
 
 
 class Tensor:
     """Stand-in of Open3D's tensor: no detach, and to numpy only from the processor's memory."""
 
-    def __init__(self, values: np.ndarray, device: str = "CUDA:0") -> None:
+    def __init__(self, values: ndarray, device: str = "CUDA:0") -> None:
         self.values, self.device, self.ndim = values, device, values.ndim
 
     def cpu(self) -> "Tensor":
         return Tensor(self.values, "CPU:0")
 
-    def numpy(self) -> np.ndarray:
+    def numpy(self) -> ndarray:
         assert self.device == "CPU:0"
         return self.values
 
@@ -81,24 +83,24 @@ class TensorMap:
 class Vectors:
     """Stand-in of Open3D's Vector3dVector: a sequence of rows, not an array."""
 
-    def __init__(self, values: np.ndarray) -> None:
+    def __init__(self, values: ndarray) -> None:
         self.values = values
 
     def __len__(self) -> int:
         return len(self.values)
 
-    def __getitem__(self, index: int) -> np.ndarray:
+    def __getitem__(self, index: int) -> ndarray:
         return self.values[index]
 
 
 class Convertible:
     """An array of a library that is not known, such as jax."""
 
-    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> ndarray:
         return np.array(POINTS, dtype)
 
 
-FORMS: dict[str, Any] = {
+FORMS = {
     "cloud": PointCloud(POINTS),
     **{kind: POINTS.astype(kind) for kind in ("f2", "f4", "f8", ">f4", "g", "i1", "u1", "i8", "u2")},
     "fortran": np.asfortranarray(POINTS),

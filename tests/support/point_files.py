@@ -4,9 +4,10 @@ import struct
 from itertools import takewhile
 
 import numpy as np
+from numpy import ndarray
 
 
-def save_ply(points: np.ndarray, order: str) -> bytes:
+def save_ply(points: ndarray, order: str) -> bytes:
     """x, y, z with a colour in between, so that columns matter."""
     head = f"ply\nformat {order} 1.0\nelement vertex {len(points)}\nproperty float x\nproperty uchar red\n"
     head += "property float y\nproperty float z\nend_header\n"
@@ -16,7 +17,7 @@ def save_ply(points: np.ndarray, order: str) -> bytes:
     return head.encode() + b"".join(struct.pack(f"{end}fBff", x, 7, y, z) for x, y, z in points.tolist())
 
 
-def save_pcd(points: np.ndarray, layout: str) -> bytes:
+def save_pcd(points: ndarray, layout: str) -> bytes:
     head = "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x _ y z\nSIZE 4 4 1 4 4\nTYPE U F U F F\nCOUNT 1 1 4 1 1\n"
     head += f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA {layout}\n"
     if layout == "ascii":

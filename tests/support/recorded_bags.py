@@ -7,11 +7,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy import ndarray
+from numpy.random import default_rng
 from PIL import Image
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_typestore
+
+from mereo.geometry.conventions import Range
 
 STAMPS = (10**9, 2 * 10**9, 3 * 10**9)
 
@@ -21,7 +25,7 @@ class Messages:
 
     def __init__(self, ros: int) -> None:
         self.store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
-        self.types: Any = self.store.types
+        self.types = self.store.types
         self.ros = ros
 
     def header(self) -> Any:
@@ -29,7 +33,7 @@ class Messages:
         more = {"seq": 0} if self.ros == 1 else {}
         return self.types["std_msgs/msg/Header"](stamp=time, frame_id="camera", **more)
 
-    def image(self, values: np.ndarray, encoding: str, padding: int = 0, big: bool = False) -> Any:
+    def image(self, values: ndarray, encoding: str, padding: int = 0, big: bool = False) -> Any:
         rows = values.astype(values.dtype.newbyteorder(">" if big else "<")).view(np.uint8).reshape(len(values), -1)
         rows = np.pad(rows, ((0, 0), (0, padding)))
         height, width = values.shape[:2]
@@ -39,7 +43,7 @@ class Messages:
             step=rows.shape[1], data=rows.reshape(-1),
         )  # fmt: skip
 
-    def compressed(self, values: np.ndarray, format_: str, quantization: tuple[float, float] = (0.0, 0.0)) -> Any:
+    def compressed(self, values: ndarray, format_: str, quantization: Range = (0.0, 0.0)) -> Any:
         """As compressed_depth_image_transport writes it: 12 bytes, then a 16-bit PNG."""
         png = BytesIO()
         Image.fromarray(values.astype(np.uint16)).save(png, format="PNG")
@@ -59,7 +63,7 @@ class Messages:
             **values,
         )  # fmt: skip
 
-    def cloud(self, points: np.ndarray) -> Any:
+    def cloud(self, points: ndarray) -> Any:
         """Two rows; x, y, z as floats after four bytes of something else, and four of padding at the end of a row."""
         field = self.types["sensor_msgs/msg/PointField"]
         rows = np.zeros((2, len(points) // 2, 4), "<f4")
@@ -73,12 +77,16 @@ class Messages:
         )  # fmt: skip
 
 
-def write_bag(path: Path, ros: int, topics: Callable[[Messages], dict[str, list[Any]]]) -> Path:
+Topics = dict[str, list[Any]]
+"""Messages of each topic."""
+
+
+def write_bag(path: Path, ros: int, topics: Callable[[Messages], Topics]) -> Path:
     """``topics`` makes the messages of each topic; they are recorded a second apart."""
     make = Messages(ros)
     plugin = StoragePlugin.MCAP if path.suffix == ".mcap" else StoragePlugin.SQLITE3
     folder = path.with_suffix("") if ros == 2 else path
-    writer: Any = Writer1(folder) if ros == 1 else Writer2(folder, version=9, storage_plugin=plugin)
+    writer = Writer1(folder) if ros == 1 else Writer2(folder, version=9, storage_plugin=plugin)
     with writer:
         for topic, messages in topics(make).items():
             kind = messages[0].__msgtype__
@@ -89,11 +97,11 @@ def write_bag(path: Path, ros: int, topics: Callable[[Messages], dict[str, list[
     return next(folder.glob("*.mcap")) if path.suffix == ".mcap" else folder
 
 
-DEPTH_MM = np.random.default_rng(0).integers(500, 2000, (3, 6, 8)).astype(np.uint16)
+DEPTH_MM = default_rng(0).integers(500, 2000, (3, 6, 8)).astype(np.uint16)
 DEPTH_MM[:, 0, 0] = 0
 
 
-def depth_topics(make: Messages) -> dict[str, list[Any]]:
+def depth_topics(make: Messages) -> Topics:
     color = np.zeros((6, 8), np.uint8)
     return {
         "/camera/color/image_raw": [make.image(color, "mono8")],

@@ -3,6 +3,7 @@
 from typing import Any
 
 import numpy as np
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 from toy_scene import toy_scene
 
@@ -28,5 +29,5 @@ def placed(model: StatisticalModel, unposed: np.ndarray, **facts: Any) -> Regist
 
 
 def by_modes(model: StatisticalModel) -> Registration:
-    z = np.random.default_rng(3).normal(size=model.count)
+    z = default_rng(3).normal(size=model.count)
     return placed(model, model.material(z), method="modes", z=z)

@@ -17,7 +17,7 @@ def ball(name: str, shift: float, color: int, level: int = 3) -> Segment:
 
 
 def example() -> tuple[PointCloud, SegmentedMesh, dict[str, object]]:
-    lost = Segment("lost", (0, 158, 115), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    lost = Segment("lost", (0, 158, 115), np.empty((0, 3)), np.empty((0, 3), np.int64))
     mesh = SegmentedMesh((ball("head", -0.1, 0), ball("tail </script><b>", 0.1, 1), lost))
     summary = {
         "title": "A <b>bold</b> </script> title",

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-import trimesh
+from trimesh.creation import box
 
 GRIPPER = """\
 <robot name="gripper">
@@ -100,8 +100,8 @@ def write_gripper(folder: Path) -> Path:
     """Write the package "grasping" with the gripper's meshes in millimetres, and return its URDF file."""
     for name in ("meshes", "urdf"):
         (folder / "grasping" / name).mkdir(parents=True, exist_ok=True)
-    palm = trimesh.creation.box((100, 50, 30)).union(trimesh.creation.box(bounds=[[5, -10, -50], [35, 20, 0]]))
-    finger = trimesh.creation.box((12, 30, 60)).union(trimesh.creation.box(bounds=[[-3, -6, 14], [27, 6, 26]]))
+    palm = box((100, 50, 30)).union(box(bounds=[[5, -10, -50], [35, 20, 0]]))
+    finger = box((12, 30, 60)).union(box(bounds=[[-3, -6, 14], [27, 6, 26]]))
     for name, mesh in (("palm", palm), ("finger", finger)):
         mesh.export(folder / f"grasping/meshes/{name}.stl")
     path = folder / "grasping/urdf/gripper.urdf"

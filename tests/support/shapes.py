@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
+from numpy.random import default_rng
 
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh
 
 
 def segment(mesh: trimesh.Trimesh, name: str = "part", color: int = 0) -> Segment:
-    return Segment(name, PALETTE[color], np.array(mesh.vertices, dtype=float), np.array(mesh.faces, dtype=np.int64))
+    return Segment(name, PALETTE[color], np.array(mesh.vertices, float), np.array(mesh.faces, np.int64))
 
 
 def box(low: tuple[float, ...], high: tuple[float, ...], name: str = "box", color: int = 0) -> Segment:
@@ -25,14 +26,14 @@ def ball(center: tuple[float, ...], radius: float, name: str = "ball", color: in
 
 def knobbly_torus(seed: int, name: str = "torus", color: int = 0) -> Segment:
     """Neither convex nor simply connected, in no special position."""
-    rng = np.random.default_rng(seed)
+    rng = default_rng(seed)
     mesh = trimesh.creation.torus(major_radius=3.0, minor_radius=1.2, major_sections=40, minor_sections=24)
     waves = rng.normal(size=(3, 3))
     points = mesh.vertices + 0.12 * np.sin(mesh.vertices @ waves.T + rng.uniform(0, 6, size=3)) @ rng.normal(
         size=(3, 3)
     )
     turn = trimesh.transformations.random_rotation_matrix(rng.random(3))[:3, :3]
-    return Segment(name, PALETTE[color], points @ turn.T, np.array(mesh.faces, dtype=np.int64))
+    return Segment(name, PALETTE[color], points @ turn.T, np.array(mesh.faces, np.int64))
 
 
 def write_model(path: Path, parts: Mapping[str, Segment]) -> Path:

@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from safetensors.numpy import save_file
@@ -62,7 +63,7 @@ def write_toy_dataset(
     examples: int = 64,
     points: int = 96,
     queries: int = 128,
-    example: Callable[[Generator, int, int], dict[str, np.ndarray]] | None = None,
+    example: Callable[[Generator, int, int], dict[str, ndarray]] | None = None,
 ) -> Path:
     """Write the dataset and return its directory; ``example(rng, points, queries)`` makes one of another kind."""
     directory.mkdir(parents=True)
@@ -86,7 +87,7 @@ def write_toy_dataset(
     return directory
 
 
-def _template() -> np.ndarray:
+def _template() -> ndarray:
     """Signed distances to the two halves of the unit ball; on the far side of the wall, to the wall's plane."""
     axis = np.linspace(-TEMPLATE_REACH, TEMPLATE_REACH, TEMPLATE_NODES)
     x, y, z = np.meshgrid(axis, axis, axis, indexing="ij")
@@ -94,7 +95,7 @@ def _template() -> np.ndarray:
     return np.stack([np.maximum(ball, x), np.maximum(ball, -x)]).astype(np.float16)
 
 
-def half_balls(rng: Generator, points: int, queries: int) -> dict[str, np.ndarray]:
+def half_balls(rng: Generator, points: int, queries: int) -> dict[str, ndarray]:
     radius, center = rng.uniform(5.0, 10.0), np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(100, 200)])
     front = unit_rows(rng.normal(size=(points, 3)))
     front[:, 2] = -np.abs(front[:, 2])
@@ -114,20 +115,20 @@ def half_balls(rng: Generator, points: int, queries: int) -> dict[str, np.ndarra
 
 
 def example_of(
-    cloud: np.ndarray,
-    places: np.ndarray,
+    cloud: ndarray,
+    places: ndarray,
     *,
-    labels: np.ndarray,
-    distances: np.ndarray,
-    directions: np.ndarray,
-    rest: np.ndarray,
-) -> dict[str, np.ndarray]:
+    labels: ndarray,
+    distances: ndarray,
+    directions: ndarray,
+    rest: ndarray,
+) -> dict[str, ndarray]:
     """Arrays of an example as they are stored, of points and distances in the camera's frame and unit."""
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     middle, scale = (low + high) / 2, 2 / (high - low).max()
     return {
         "cloud": ((cloud - middle) * scale).astype(np.float32),
-        "cloud_count": np.array(len(cloud), dtype=np.int32),
+        "cloud_count": np.array(len(cloud), np.int32),
         "center": middle,
         "scale": np.array(scale),
         "positions": ((places - middle) * scale).astype(np.float32),

@@ -6,6 +6,8 @@ Its maps are in closed form and its sampler is a plain function, so that worker 
 from dataclasses import dataclass
 
 import numpy as np
+from numpy import ndarray
+from numpy.random import Generator
 from shapes import ball, box
 
 from mereo.deformation.draw_names import named, part
@@ -22,11 +24,11 @@ class Shear:
     b: float
     c: float
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
+    def __call__(self, points: ndarray) -> ndarray:
         x, y, z = points.T
         return np.stack([x + self.a * np.sin(z / 9), y + self.b * x, (1 + self.c) * z], axis=1)
 
-    def inverse(self, points: np.ndarray) -> np.ndarray:
+    def inverse(self, points: ndarray) -> ndarray:
         x, y, z = points.T
         z = z / (1 + self.c)
         x0 = x - self.a * np.sin(z / 9)
@@ -38,11 +40,11 @@ class Lift:
     height: float
     then: Shear
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
+    def __call__(self, points: ndarray) -> ndarray:
         return self.then(points + np.array([0.0, 0.0, self.height]))
 
 
-def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
+def sample_deformations(rng: Generator) -> tuple[Deformation, ...]:
     shear = Shear(*(named(rng, "shear").uniform(-1, 1, size=3) * [3.0, 0.3, 0.2]))
     with part(rng, "ball"):
         lift = Lift(float(named(rng, "lift").uniform(0.5, 3.0)), shear)

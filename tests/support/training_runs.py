@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file
+from torch import Tensor
 
 from mereo_learning import trainer
 from mereo_learning.config import TrainConfig
@@ -28,7 +29,7 @@ def diverge_at(monkeypatch: pytest.MonkeyPatch, step: int, loss: float, gradient
     """From ``step`` on the loss, or its gradient, is what is given here."""
     original = trainer.Trainer._loss
 
-    def spoilt(self: trainer.Trainer, batch: Batch) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    def spoilt(self: trainer.Trainer, batch: Batch) -> tuple[Tensor, dict[str, Tensor]]:
         value, terms = original(self, batch)
         if self.step + 1 >= step:
             value = value + (loss if math.isnan(gradient) else 0.0)

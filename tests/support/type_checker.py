@@ -10,9 +10,9 @@ from typing import Any
 
 from beartype import BeartypeConf, beartype
 
-CHECKED: Any = beartype(conf=BeartypeConf(is_pep484_tower=True))
+CHECKED = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
-_made: dict[tuple[object, ...], Any] = {}
+_made = {}
 
 
 def check(function: Callable[..., Any]) -> Any:

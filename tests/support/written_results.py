@@ -17,7 +17,7 @@ SIDES = np.array([0.02, 0.04, 0.08])
 def segments() -> SegmentedMesh:
     """Names and colours that exporters tend to change: spaces, accents, dark colours; one segment without faces."""
     ball, box = trimesh.creation.icosphere(2, radius=0.01), trimesh.creation.box(SIDES)
-    lost = Segment(NAMES[1], COLORS[1], np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+    lost = Segment(NAMES[1], COLORS[1], np.empty((0, 3)), np.empty((0, 3), np.int64))
     return SegmentedMesh(
         (
             Segment(NAMES[0], COLORS[0], ball.vertices + CENTER - [0, 0.05, 0], np.array(ball.faces)),
@@ -29,7 +29,7 @@ def segments() -> SegmentedMesh:
 
 def grid() -> LabelGrid:
     """The box is label 3, and the voxel at its corner with the largest x, y, z is label 1; 5 mm voxels, no cube."""
-    labels = np.zeros((7, 11, 20), dtype=np.uint8)
+    labels = np.zeros((7, 11, 20), np.uint8)
     origin, spacing = np.array([0.085, 0.175, 0.4525]), np.full(3, 0.005)
     places = np.stack(np.meshgrid(*(np.arange(n) for n in labels.shape), indexing="ij"), axis=-1) * spacing + origin
     labels[(np.abs(places - CENTER) <= SIDES / 2 + 1e-9).all(axis=-1)] = 3
@@ -45,5 +45,5 @@ def centroid(label: int) -> np.ndarray:
 
 def cloud() -> SegmentedCloud:
     points = np.array([[0.1, 0.2, 0.5], [0.11, 0.22, 0.54], [-0.1, 0.3, 0.7]])
-    labels = np.array([3, 1, 3], dtype=np.uint8)
+    labels = np.array([3, 1, 3], np.uint8)
     return SegmentedCloud(points, labels, np.array([0.9, 0.6, 0.8]), np.array([0.5, 0.4, 0.01]), NAMES, COLORS)

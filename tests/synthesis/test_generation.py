@@ -5,11 +5,11 @@ import os
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 import pytest
-from folder_contents import contents, read_json
+from folder_contents import contents, read_json, run_mereo
 from numpy.linalg import norm
 from numpy.random import Generator
 from safetensors.numpy import load_file
@@ -27,6 +27,7 @@ from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.models.model import Model
 from mereo.models.trained import EncodedCloud
 from mereo.models.weights import load_model
@@ -158,9 +159,7 @@ def test_a_broken_manifest_cannot_be_resumed_nor_a_file_take_a_dataset(tmp_path:
         ({"examples": 10**10}, r"examples=10000000000 needs .* GB and .* GB free: ask for fewer, or change"),
     ],
 )
-def test_wrong_numbers_are_named_before_anything_is_written(
-    tmp_path: Path, options: dict[str, Any], message: str
-) -> None:
+def test_wrong_numbers_are_named_before_anything_is_written(tmp_path: Path, options: JsonObject, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         generate(TOY, tmp_path / "data", SMALL, **{"examples": 4, "seed": 1} | options)
     assert not (tmp_path / "data").exists()
@@ -241,7 +240,7 @@ def test_unknown_and_contradictory_options_are_refused_before_anything_is_writte
     options: str, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
     try:
-        code = command_line.main([*options.split(), "--output", str(tmp_path / "out")])
+        code = run_mereo(*options.split(), "--output", tmp_path / "out")
     except SystemExit as leaving:
         code = leaving.code
     printed = capsys.readouterr().err
@@ -264,7 +263,7 @@ def test_a_scene_has_its_own_workspace_a_cone_and_the_sphere() -> None:
 def test_evaluation_looks_through_the_sensor_from_the_workspace_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clouds: list[PointCloud] = []
+    clouds = []
     encode = Model.encode
 
     def watch(model: Model, cloud: PointCloud) -> EncodedCloud:

@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_array_equal
 from shapes import box
 
+from mereo.geometry.conventions import Pair, Range
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.synthesis import query_sampling
@@ -28,26 +30,26 @@ from mereo.synthesis.query_sampling import (
 class Balls:
     """Balls in any dimension; every answer in closed form."""
 
-    def __init__(self, *balls: tuple[tuple[float, ...], float], nesting: tuple[tuple[int, int], ...] = ()) -> None:
+    def __init__(self, *balls: tuple[tuple[float, ...], float], nesting: tuple[Pair, ...] = ()) -> None:
         self.centers, self.radii = np.array([c for c, _ in balls]), np.array([r for _, r in balls])
         self.count, self.nesting = len(balls), nesting
 
-    def boxes(self) -> np.ndarray:
+    def boxes(self) -> ndarray:
         return np.stack([self.centers - self.radii[:, None], self.centers + self.radii[:, None]], axis=1)
 
-    def radius(self, index: int, points: np.ndarray) -> np.ndarray:
+    def radius(self, index: int, points: ndarray) -> ndarray:
         return norm(points - self.centers[index], axis=1)
 
-    def inside(self, index: int, points: np.ndarray) -> np.ndarray:
+    def inside(self, index: int, points: ndarray) -> ndarray:
         return self.radius(index, points) < self.radii[index]
 
-    def label(self, points: np.ndarray) -> np.ndarray:
-        labels = np.zeros(len(points), dtype=np.uint8)
+    def label(self, points: ndarray) -> ndarray:
+        labels = np.zeros(len(points), np.uint8)
         for index in reversed(range(self.count)):
             labels[self.inside(index, points)] = index + 1
         return labels
 
-    def segment_distance(self, index: int, points: np.ndarray) -> np.ndarray:
+    def segment_distance(self, index: int, points: ndarray) -> ndarray:
         return np.abs(self.radius(index, points) - self.radii[index])
 
 
@@ -66,8 +68,8 @@ def one_at_a_time(shape: Shape, keep: int, draw: int, seed: int, nested: bool) -
     points, labels = [], []
     for index, (low, high) in enumerate(extended_boxes(shape)):
         stream = default_rng(seeds[index])
-        inside: list[tuple[np.ndarray, int]] = []
-        outside: list[tuple[np.ndarray, int]] = []
+        inside = []
+        outside = []
         while len(inside) < draw or len(outside) < draw:
             point = low + stream.random(len(low)) * (high - low)
             label = int((owner_labels(shape, point[None]) if nested else shape.label(point[None]))[0])
@@ -80,7 +82,7 @@ def one_at_a_time(shape: Shape, keep: int, draw: int, seed: int, nested: bool) -
             nearest = sorted(np.argsort(distance)[:keep])
             points += [side[i][0] for i in nearest]
             labels += [side[i][1] for i in nearest]
-    return Samples(np.array(points), np.array(labels, dtype=np.uint8))
+    return Samples(np.array(points), np.array(labels, np.uint8))
 
 
 @pytest.mark.parametrize("nested", [False, True])
@@ -178,7 +180,7 @@ def test_bad_settings() -> None:
     ],
 )
 def test_segments_that_are_never_hit_or_never_missed(
-    radii: tuple[float, float], message: str, monkeypatch: pytest.MonkeyPatch
+    radii: Range, message: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(query_sampling, "MAX_DRAWS", 30_000)
     with pytest.raises(ValueError, match=f"^{message}$"):

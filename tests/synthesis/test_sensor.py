@@ -1,12 +1,14 @@
 """Simulated sensors: each term is what its formula says, after a depth camera that is one of closed forms."""
 
 from dataclasses import replace
+from math import pi
 from statistics import NormalDist
 
 import numpy as np
 import pytest
 import trimesh
-from numpy.linalg import norm
+from numpy import ndarray
+from numpy.linalg import norm, svd
 from numpy.random import default_rng
 from shapes import ball, box, one, segment
 from toy_scene import toy_scene
@@ -36,7 +38,7 @@ CAMERA = Camera.from_fov(96, 96, np.deg2rad(35))
 RAYS = CAMERA.directions()
 OFF = SensorConfig()
 UNIT_M = OFF.metres_per_unit
-MODELS: tuple[SensorModel, ...] = ("structured-light", "time-of-flight")
+MODELS = ("structured-light", "time-of-flight")
 
 
 def wall(z: float, tilt_deg: float = 0.0) -> Solids:
@@ -46,7 +48,7 @@ def wall(z: float, tilt_deg: float = 0.0) -> Solids:
     return Solids(one(replace(part, vertices=part.vertices @ turn.T + [0, 0, z])))
 
 
-def slant(tilt_deg: float) -> np.ndarray:
+def slant(tilt_deg: float) -> ndarray:
     """Angle between each ray and that wall's normal."""
     normal = np.array([np.sin(np.deg2rad(tilt_deg)), 0, np.cos(np.deg2rad(tilt_deg))])
     return np.arccos(np.abs(RAYS @ normal) / norm(RAYS, axis=-1))
@@ -60,13 +62,13 @@ def test_published_values() -> None:
     """By hand from the papers' formulas: Kinect at 1 m and at 0.4 m and 45 degrees, Kinect v2 at 2 m; pixels."""
     z, flat = np.array([1.0]), np.zeros(1)
     assert axial_std_m(z, flat) == pytest.approx(0.001884)
-    assert axial_std_m(np.array([0.4]), np.array([np.pi / 4])) == pytest.approx(0.0012 + 0.0001 / np.sqrt(0.4))
+    assert axial_std_m(np.array([0.4]), np.array([pi / 4])) == pytest.approx(0.0012 + 0.0001 / np.sqrt(0.4))
     assert axial_std_m(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0017)
     assert lateral_std(z, flat) * 585 == pytest.approx(0.8)
-    assert lateral_std(z, np.array([np.pi / 4])) * 585 == pytest.approx(0.835)
+    assert lateral_std(z, np.array([pi / 4])) * 585 == pytest.approx(0.835)
     assert lateral_std(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0008)
-    assert np.isfinite(axial_std_m(np.linspace(0.5, 4, 50), np.full(50, np.pi / 2))).all()
-    dropout = dropout_probability(np.linspace(0, np.pi / 2, 91), 0.7)  # from 60 degrees on
+    assert np.isfinite(axial_std_m(np.linspace(0.5, 4, 50), np.full(50, pi / 2))).all()
+    dropout = dropout_probability(np.linspace(0, pi / 2, 91), 0.7)  # from 60 degrees on
     assert (dropout[:61] < 1e-9).all() and (np.diff(dropout[60:]) > 0).all() and dropout[-1] == pytest.approx(0.7)
 
 
@@ -146,20 +148,20 @@ def test_holes_take_the_expected_area() -> None:
     """Independent radii: pi r^2 each, on a wall where few reach over the border or overlap."""
     views = [look(wall(150.0), seed, holes=2.0, hole_radius_m=0.02).image.valid for seed in range(150)]
     pixel = 150.0 * UNIT_M / CAMERA.focal_x_px
-    expected = 2 * np.pi * (0.02 / pixel) ** 2
+    expected = 2 * pi * (0.02 / pixel) ** 2
     lost = np.array([(~valid).sum() for valid in views])
     assert 0.8 < lost.mean() / expected < 1.0
     assert abs((lost == 0).mean() - np.exp(-2)) < 5 * np.sqrt(np.exp(-2) / len(views))
 
 
-def masks(seen: np.ndarray, count: int = 300, **terms: float) -> np.ndarray:
+def masks(seen: ndarray, count: int = 300, **terms: float) -> ndarray:
     drawn = (dict(zip(SENSOR_TERMS, default_rng(i).spawn(11), strict=True)) for i in range(count))
     return np.stack([sample_mask(seen, replace(OFF, **terms), rngs) for rngs in drawn])
 
 
 def test_the_mask_is_off_and_shifted_as_probably_as_asked() -> None:
     """Pixels beside a straight edge are half a pixel away from it, the next ones one and a half."""
-    seen = np.zeros((60, 60), dtype=bool)
+    seen = np.zeros((60, 60), bool)
     seen[:, :30] = True
     drawn = masks(seen, mask_offset_px=0.8)
     for column, distance in ((30, 0.5), (31, 1.5)):
@@ -296,7 +298,7 @@ def test_a_wrong_mask_lets_background_and_tools_in_and_loses_the_object() -> Non
         seen = look(PAIR, seed, background=1.0, mask_offset_px=1.0)
         leaked.append((seen.image.valid & (seen.source == BACKGROUND)).sum())
         lost.append(truth - seen.object_points)
-    outline = 2 * np.pi * 15 + 96
+    outline = 2 * pi * 15 + 96
     assert 0.5 < np.mean(leaked) / np.mean(lost) < 2
     assert 0.1 * outline < np.mean(leaked) < outline
     alone = look(PAIR, 0, mask_offset_px=1.0)
@@ -324,8 +326,8 @@ def test_a_background_is_behind_everything_and_outside_a_true_mask() -> None:
         plane = seen.source == BACKGROUND
         points = (seen.whole.depth[..., None] * RAYS)[plane]
         center = points.mean(axis=0)
-        normal = np.linalg.svd(points - center, full_matrices=False)[2][2]
+        normal = svd(points - center, full_matrices=False)[2][2]
         normal *= np.sign(normal[2])
-        assert normal[2] > np.cos(np.pi / 4) - 1e-9
+        assert normal[2] > np.cos(pi / 4) - 1e-9
         gap = (center - vertices) @ normal
         assert -1e-6 < gap.min() < 0.05 / UNIT_M + 1e-6

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folder_contents import read_json
+from folder_contents import read_json, run_mereo
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 from numpy.testing import assert_allclose, assert_array_equal
@@ -33,7 +34,7 @@ from mereo.synthesis.recording import (
 SHORT = SequenceConfig(seconds=1.0, rate=12.0, occluded=0.5, image_size=48)
 
 
-def places(scene: Scene, seed: int, times_s: np.ndarray) -> np.ndarray:
+def places(scene: Scene, seed: int, times_s: ndarray) -> ndarray:
     states = walk(scene, seed, times_s, change_s=1.0)
     return np.stack([scene.deform(one.deformations).mesh.merged()[0] for one in states])
 
@@ -89,7 +90,7 @@ def test_a_walk_goes_round_what_the_scene_refuses_and_tells_where_that_is_everyt
     states = walk(refusing(0.2), 0, np.arange(20) / 10, 1.0)
     drawn = np.array([2 * one.calls[0].shares[0] - 1 for one in states])
     assert (np.abs(np.abs(drawn) - 0.5) < 0.2).all() and len(np.unique(np.sign(drawn))) == 1 and np.ptp(drawn) > 0.01
-    allowed: list[float] = []
+    allowed = []
 
     def draw(rng: Generator) -> tuple[Deformation, ...]:
         a = float(rng.uniform(-1.0, 1.0))
@@ -156,10 +157,10 @@ def test_a_recording_holds_frames_and_their_truth_to_be_played_again(tmp_path: P
 def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "rope"
     small = ["--seconds", "0.2", "--rate", "10", "--seed", "3"]
-    assert command_line.main(["scene", "record", "rope", "--output", str(out), *small]) == 0
+    assert run_mereo("scene", "record", "rope", "--output", out, *small) == 0
     assert "2 frames in 0.2 s" in capsys.readouterr().out and len(list((out / "frames").iterdir())) == 2
     options = ["--weights", "rope", "--every-frame", "--rate", "10", "--resolution", "16"]
-    assert command_line.main(["stream", str(out), *options]) == 0
+    assert run_mereo("stream", out, *options) == 0
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
     assert [(one["method"], one["tracked"]) for one in lines] == [("modes", False), ("modes", True)]
     assert all(one["explained"] > 0.9 for one in lines)

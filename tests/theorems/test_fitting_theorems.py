@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from answers import fit_correspondences
 from fit_cases import IN_FRONT, said, shown
-from numpy.linalg import norm
+from numpy.linalg import norm, solve
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.fitting.problem.evidence import UNSEEN_PITCHES, Evidence
@@ -19,7 +20,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 
 def test_more_noise_never_makes_the_residual_smaller(toy_model: StatisticalModel) -> None:
     points, material = shown(toy_model, 0.5)
-    noise = np.random.default_rng(0).normal(size=(len(points), 1)) * points / norm(points, axis=1)[:, None]
+    noise = default_rng(0).normal(size=(len(points), 1)) * points / norm(points, axis=1)[:, None]
     residuals = []
     for std in (0.0, 0.05, 0.1, 0.2, 0.4, 0.8):
         registration = fit_correspondences(points + std * noise, said(toy_model, material), toy_model, 1.0)
@@ -76,13 +77,13 @@ def test_what_a_line_of_sight_misses_or_meets_far_off_is_compared_with_the_neare
 
 
 def test_residuals_beside_a_nuisance_are_those_of_a_fit_that_has_it() -> None:
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     jacobian, nuisance, residual = rng.normal(size=(40, 3)), rng.normal(size=(40, 5)), rng.normal(size=40)
     weight = rng.random(40)
     rows = np.block([[jacobian, nuisance], [np.zeros((5, 3)), np.eye(5)]]) * np.sqrt(np.r_[weight, np.ones(5)])[:, None]
     whole = np.linalg.lstsq(rows, np.r_[residual * np.sqrt(weight), np.zeros(5)])
     pulls = pull(jacobian, weight, nuisance)
-    step = np.linalg.solve(jacobian.T @ pulls, pulls.T @ residual)
+    step = solve(jacobian.T @ pulls, pulls.T @ residual)
     assert_allclose(np.r_[step, amplitudes(residual - jacobian @ step, weight, nuisance)], whole[0])
     assert_allclose(pull(jacobian, weight, nuisance[:, :0]).T, jacobian.T * weight)
 
@@ -96,7 +97,7 @@ def test_noise_that_neighbours_share_is_alike_as_far_as_they_share_it() -> None:
     evidence = replace(evidence, shared_noise=SharedNoise(0.5, 0.03, 0.001))
     vars(evidence)["roughness"] = 0.0
     errors = evidence.with_errors.shared_errors.rows(np.arange(20 * 41, 21 * 41))
-    along, aside = (errors.along(np.tile(np.eye(3)[axis], (41, 1))).astype(np.float64) for axis in (2, 0))
+    along, aside = (errors.along(np.tile(np.eye(3)[axis], (41, 1))).astype(float) for axis in (2, 0))
     distance = np.abs(across[:, None] - across) / 100.0
     assert_allclose(along @ along.T, 0.25 * np.exp(-np.pi * (distance / 0.03) ** 2), atol=0.03)
     assert_allclose((aside**2).sum(axis=1), (UNSEEN_PITCHES * 0.001 * 100.0) ** 2, rtol=0.1)

@@ -8,25 +8,28 @@ import signal
 import socket
 import subprocess
 import sys
-import urllib.request
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
 import trimesh
 from answers import answer_to
 from browser import Page, needs_browser, pixels_of, until
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, wall
 from toy_scene import rest_mesh, toy_scene
+from trimesh.creation import box, icosphere
 
 from mereo.__main__ import main
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import Names, Triple
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import Scores
 from mereo.geometry.radii import Radii
@@ -67,12 +70,12 @@ def toy_content() -> Content:
     points = np.concatenate([segment.vertices[::2] for segment in mesh.segments])
     cloud = PointCloud(points[points[:, 2] <= 162.0])
 
-    def ask(points: np.ndarray) -> Probed:
+    def ask(points: ndarray) -> Probed:
         label = np.where(np.abs(points[:, 1]) < 6, 1 + np.clip((points[:, 0] + 18) // 12, 0, 2), 0).astype(np.uint8)
         toward = np.tile([0.0, 0.0, -1.0], (len(points), 1))
         return Probed(label, points[:, 2] - 150.0, toward, np.eye(5)[label])
 
-    def by_depth() -> tuple[list[np.ndarray], ColorScale]:
+    def by_depth() -> tuple[list[ndarray], ColorScale]:
         scale = ColorScale("depth of the toy", 130.0, 170.0, ((0, 0, 0), (250, 250, 250)), ("near", "far"))
         return [scale.colors(segment.vertices[:, 2]) for segment in mesh.segments], scale
 
@@ -123,7 +126,7 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
 
 @needs_viser
 def test_a_click_on_what_the_camera_saw_has_it_answered_there(server: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    around, clicked = PointCloud(np.array([[-40.0, 0, 170], [0, 0, 150], [60, 20, 160]])), list[np.ndarray]()
+    around, clicked = PointCloud(np.array([[-40.0, 0, 170], [0, 0, 150], [60, 20, 160]])), list[ndarray]()
     contents = [replace(toy_content(), title="again", verdict="as clicked", colorings={}), ValueError("nothing there")]
 
     def content_of(_: object) -> Content:
@@ -164,7 +167,7 @@ def test_what_is_around_others_is_seen_through_and_axes_are_of_a_round_length(se
     assert page.controls.opacity() == [1.0, 0.4]
     nodes = server.scene._handle_from_node_name  # type: ignore[attr-defined]
     ends = page.stage.back(nodes["/axes"].points[:, 1].astype(float))
-    np.testing.assert_allclose(ends - page.content.bounds[0], 0.1 * np.eye(3), atol=1e-5)
+    assert_allclose(ends - page.content.bounds[0], 0.1 * np.eye(3), atol=1e-5)
     assert nodes["/axes/y"].text == "y 10 cm" and "x right, y down, z away; each 10 cm long" in page.hint.content
     assert round_length(0.3, UNKNOWN) == (0.2, "0.2 units") and round_length(70, Unit(0.001)) == (50, "50 mm")
 
@@ -174,7 +177,7 @@ def test_what_is_around_others_is_seen_through_and_axes_are_of_a_round_length(se
 def test_a_page_looks_at_the_middle_of_the_object_from_where_all_of_it_is_seen(server: object, aspect: float) -> None:
     stage, camera, bounds = ResultPage(server, toy_content()).stage, SimpleNamespace(), toy_content().bounds
     stage._turn(camera, aspect)
-    np.testing.assert_allclose(camera.look_at, stage.place(bounds.mean(axis=0)), atol=1e-9)
+    assert_allclose(camera.look_at, stage.place(bounds.mean(axis=0)), atol=1e-9)
     half_angle = np.arctan(np.tan(np.deg2rad(20)) * min(aspect, 1))
     radius = norm(np.subtract(camera.position, camera.look_at)) * np.sin(half_angle)
     assert radius == pytest.approx(norm(np.ptp(bounds, axis=0)) / 2 * stage.scale), "of the ball around it"
@@ -231,7 +234,7 @@ def test_a_viser_that_starts_otherwise_is_refused(monkeypatch: pytest.MonkeyPatc
 def test_a_page_is_on_this_machine_only_and_a_taken_port_is_said(server: object) -> None:
     port = server.get_port()  # type: ignore[attr-defined]
     assert server.get_host() == "127.0.0.1"  # type: ignore[attr-defined]
-    with urllib.request.urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
+    with urlopen(f"http://127.0.0.1:{port}", timeout=20) as answer:
         assert answer.status == 200
     with pytest.raises(OSError, match=f"port {port} is taken or not allowed; choose another one with --port"):
         viewer_server.start_server(port)
@@ -248,7 +251,7 @@ def test_the_command_prints_where_the_page_is_and_ends_cleanly(tmp_path: Path) -
             line = process.stdout.readline()
             address = re.search(r"open (http://127\.0\.0\.1:\d+) in a browser", line)
             assert address, line
-            with urllib.request.urlopen(address[1], timeout=60) as answer:
+            with urlopen(address[1], timeout=60) as answer:
                 assert b"<html" in answer.read()
             process.send_signal(signal.SIGINT)
             assert process.wait(timeout=60) == 0
@@ -270,7 +273,7 @@ def test_without_viser_one_sentence_names_the_extra(
 def test_names_cannot_break_the_panels() -> None:
     name = "<script>x</script>"
     answer = Probed(
-        np.array([1], dtype=np.uint8),
+        np.array([1], np.uint8),
         np.array([-0.002]),
         np.array([[0.0, 1.0, 0.0]]),
         np.array([[0.25, 0.75]]),
@@ -330,9 +333,7 @@ def test_what_the_laboratory_cannot_show_is_said_in_one_sentence(rope: Model) ->
     "low, high, value, ends",
     [(0.0, 1.0, 0.5, (0.0, 1.0, 0.01)), (-3.14, 31.4, 0.0, (-3.2, 31.4, 0.1)), (-180.0, 180.0, 0.0, (-180, 180, 1.0))],
 )
-def test_a_slider_has_few_digits_and_a_hundred_steps(
-    low: float, high: float, value: float, ends: tuple[float, float, float]
-) -> None:
+def test_a_slider_has_few_digits_and_a_hundred_steps(low: float, high: float, value: float, ends: Triple) -> None:
     slider = replace(parameters(random_state(toy_scene(), 0))[0], low=low, high=high, value=value)
     assert slider_range(slider) == pytest.approx(ends)
     assert slider_range(replace(slider, low=2.0, high=5.0, whole=True)) == (2.0, 5.0, 1.0)
@@ -360,7 +361,7 @@ def test_sliders_and_buttons_change_what_is_shown(server: object) -> None:
 @needs_viser
 def test_of_many_changes_the_newest_of_each_control_counts(server: object) -> None:
     page = LabPage(server, Laboratory(toy_scene(), None, None))
-    asked: list[int] = []
+    asked = []
     with page._working:  # changes come while the page is at work
         for number in range(5):
             page._changes["x"] = lambda shape, number=number: asked.append(number) or shape  # type: ignore[func-returns-value]
@@ -470,17 +471,17 @@ def test_our_own_glb_is_in_the_frame_of_the_input(folder: Path) -> None:
 def write_strange(path: Path) -> None:
     """GLB file of somebody else: a moved and mirrored box of vertex colours, a plain one twice, a texture, points."""
     scene = trimesh.Scene()
-    painted = trimesh.creation.box((1, 1, 1))
-    painted.visual.vertex_colors = np.array([[255, 0, 0, 255]] * 4 + [[0, 0, 255, 255]] * 4, dtype=np.uint8)
+    painted = box((1, 1, 1))
+    painted.visual.vertex_colors = np.array([[255, 0, 0, 255]] * 4 + [[0, 0, 255, 255]] * 4, np.uint8)
     mirrored = np.diag([-1.0, 1.0, 1.0, 1.0])
     mirrored[0, 3] = 5.0
     scene.add_geometry(painted, node_name="painted", geom_name="painted", transform=mirrored)
-    plain = trimesh.creation.box((1, 1, 1))
+    plain = box((1, 1, 1))
     material = trimesh.visual.material.PBRMaterial(baseColorFactor=[255, 0, 0, 255])
     plain.visual = trimesh.visual.TextureVisuals(material=material)
     scene.add_geometry(plain, node_name="plain", geom_name="plain")
-    round_one = trimesh.creation.icosphere(1)
-    picture = Image.fromarray(np.full((4, 4, 3), (0, 128, 255), dtype=np.uint8))
+    round_one = icosphere(1)
+    picture = Image.fromarray(np.full((4, 4, 3), (0, 128, 255), np.uint8))
     round_one.visual = trimesh.visual.TextureVisuals(uv=np.full((len(round_one.vertices), 2), 0.5), image=picture)
     scene.add_geometry(round_one, node_name="round", geom_name="round")
     scene.add_geometry(trimesh.PointCloud(np.eye(3)), node_name="points", geom_name="points")
@@ -580,7 +581,7 @@ def test_weights_without_a_model_are_asked_alone_and_it_is_said(rope: Model) -> 
 )
 def test_what_cannot_be_shown_is_said_in_one_sentence(
     content: bytes | None,
-    arguments: tuple[str, ...],
+    arguments: Names,
     sentence: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,

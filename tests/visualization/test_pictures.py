@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 from answers import answer_to
+from folder_contents import run_mereo
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -16,8 +18,8 @@ from PIL import Image
 from shapes import ball as round_ball
 
 import mereo
-from mereo import __main__ as command_line
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
+from mereo.geometry.conventions import Triple
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, vertex_normals
 from mereo.geometry.transforms import rigid
 from mereo.models.model import Model
@@ -56,14 +58,14 @@ from mereo_viewer.result_page import ask_network, first_point, probe_answer
 FRONT = ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0))
 
 
-def ball(center: tuple[float, float, float], radius: float, color: Color = PALETTE[0], name: str = "ball") -> Segment:
+def ball(center: Triple, radius: float, color: Color = PALETTE[0], name: str = "ball") -> Segment:
     mesh = trimesh.creation.icosphere(4, radius=radius)
     return Segment(name, color, mesh.vertices + np.array(center), np.array(mesh.faces))
 
 
-def hue_is(pixels: np.ndarray, color: Color) -> np.ndarray:
+def hue_is(pixels: ndarray, color: Color) -> ndarray:
     """Pixels whose colour is ``color`` at some brightness."""
-    wanted = np.asarray(color, dtype=float)
+    wanted = np.asarray(color, float)
     values = pixels.astype(float)
     cosine = (values @ wanted) / np.maximum(norm(values, axis=-1) * norm(wanted), 1e-9)
     return (cosine > 0.985) & (values.sum(axis=-1) > 30)
@@ -158,9 +160,7 @@ def test_voxel_faces_are_a_closed_outward_surface_of_the_right_volume() -> None:
     assert_allclose(high, [3, 2, 1] + (filled.max(axis=0) + 0.5) * spacing)
 
 
-def labelled(
-    truth: np.ndarray, found: np.ndarray, spacing: tuple[float, float, float] = (1.0, 1.0, 1.0)
-) -> EvaluatedView:
+def labelled(truth: ndarray, found: ndarray, spacing: Triple = (1.0, 1.0, 1.0)) -> EvaluatedView:
     """A case whose first cell is centred at the origin, and whose cloud is the true cells."""
     cloud = PointCloud(np.argwhere(truth)[::7] * np.array(spacing))
     colors = [(0, 158, 115), (240, 228, 66), (86, 180, 233)]
@@ -177,7 +177,7 @@ def test_the_segmentation_is_wrong_anywhere_it_differs() -> None:
     assert set(np.unique(segmentation_error(labelled(truth, truth)))) == {0, 1}
 
 
-def two_boxes() -> np.ndarray:
+def two_boxes() -> ndarray:
     labels = np.zeros((20, 20, 20), np.uint8)
     labels[5:15, 5:10, 5:15], labels[5:15, 10:15, 5:15] = 1, 2
     return labels
@@ -215,12 +215,12 @@ def test_offsets_are_pale_within_the_tolerance_and_for_rounding_and_full_at_the_
     assert_allclose(exact, np.broadcast_to(np.asarray(PALE) / 255, exact.shape))
 
 
-def strips(picture: np.ndarray) -> int:
+def strips(picture: ndarray) -> int:
     """Height of the scale and of the legend below a picture of errors."""
     return 44 + len(legend(SEGMENTATION_WORDS, (PALE, WRONG, EXTRA_OR_MISSING), picture.shape[1]))
 
 
-def columns_of(picture: np.ndarray) -> list[np.ndarray]:
+def columns_of(picture: ndarray) -> list[ndarray]:
     """Columns of a picture of errors."""
     return np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
 
@@ -278,13 +278,13 @@ CENTER = np.array([8.1, 7.9, 8.05])
 CELLS = (32, 52, 40)
 
 
-def ball_cells(radius: float) -> np.ndarray:
+def ball_cells(radius: float) -> ndarray:
     """Occupied cells of a ball on the anisotropic grid."""
     grid = np.indices(CELLS).transpose(1, 2, 3, 0) * SPACING
     return np.asarray(norm(grid - CENTER, axis=-1) < radius)
 
 
-def directions() -> np.ndarray:
+def directions() -> ndarray:
     drawn = default_rng(5).normal(size=(400, 3))
     return np.asarray(drawn / norm(drawn, axis=1, keepdims=True))
 
@@ -299,7 +299,7 @@ def test_the_offset_of_concentric_balls_is_the_difference_of_their_radii(truth: 
 
 
 def test_what_is_missing_is_the_farther_off_the_longer_it_is() -> None:
-    truth = np.zeros((40, 20, 20), dtype=bool)
+    truth = np.zeros((40, 20, 20), bool)
     truth[5:35, 8:12, 8:12] = True
     found = truth.copy()
     found[20:] = False
@@ -328,7 +328,7 @@ def test_a_scale_is_linear_between_its_stops_and_vertex_normals_of_a_ball_point_
 def test_confidence_is_the_drop_of_probability_across_the_surface() -> None:
     """A model that is certain of one ball's border, and says one half everywhere near the other's."""
 
-    def ask(points: np.ndarray) -> Answer:
+    def ask(points: ndarray) -> Answer:
         inside = (norm(points, axis=1) < 2.0).astype(float)
         unsure = 0.5 * (norm(points - [6, 0, 0], axis=1) < 3.0)
         probability = np.stack([1 - inside - unsure, inside, unsure], axis=1)
@@ -348,7 +348,7 @@ def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
     assert two.max() == pytest.approx(6.0, abs=0.05)
     scale = distance_scale([one, two], " mm")
     assert 0 < scale.high <= 6 and scale.words[1].endswith(" mm, guessed")
-    lost = replace(mesh.segments[1], vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), dtype=np.int64))
+    lost = replace(mesh.segments[1], vertices=np.zeros((0, 3)), faces=np.zeros((0, 3), np.int64))
     mesh = SegmentedMesh((mesh.segments[0], lost))
     assert [len(v) for v in observed_distance(mesh, np.zeros((1, 3)))] == [len(mesh.segments[0].vertices), 0]
     assert distance_scale([np.zeros(0)], "").high > 0
@@ -363,9 +363,9 @@ def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
 
 
 @pytest.fixture
-def encoded(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
+def encoded(monkeypatch: pytest.MonkeyPatch) -> list[ndarray]:
     """The points of every cloud that a model encodes."""
-    clouds: list[np.ndarray] = []
+    clouds = []
     encode = Model.encode
 
     def counted(model: Model, cloud: PointCloud) -> EncodedCloud:
@@ -376,7 +376,7 @@ def encoded(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
     return clouds
 
 
-def test_no_cloud_is_encoded_twice(encoded: list[np.ndarray], tmp_path: Path) -> None:
+def test_no_cloud_is_encoded_twice(encoded: list[ndarray], tmp_path: Path) -> None:
     cloud = load_view("rope").depth.to_points()
     mereo.reconstruct(cloud, load_model("rope"), "network", resolution=16).save(tmp_path / "result")
     assert len(encoded) == 1
@@ -436,7 +436,7 @@ def test_a_run_with_curves_says_nothing(tmp_path: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.usefixtures("no_matplotlib")
 def test_an_experiment_asks_for_the_extra_before_it_starts(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    assert command_line.main(["experiment", "sampling", "--output", str(tmp_path / "out")]) == 2
+    assert run_mereo("experiment", "sampling", "--output", tmp_path / "out") == 2
     assert capsys.readouterr().err == (
         "mereo: error: matplotlib, which draws charts, is not installed: pip install 'mereo[plots]'\n"
     )

@@ -5,13 +5,13 @@ import io
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 from browser import Page, needs_browser, pixels_of, until
 from numpy.linalg import norm
+from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
@@ -19,6 +19,7 @@ from reported_scenes import ball, example, page_data, positions, wall
 from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognition, Signs
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
+from mereo.io.atomic_files import JsonObject
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, page_words, trust
 from mereo.visualization.renderer import enclosed
@@ -213,9 +214,9 @@ def recognized(known: bool | str, reason: str | None = None) -> Recognition:
     ],
 )
 def test_a_verdict_is_one_line_with_its_reason(
-    recognition: Recognition | None, registration: dict[str, Any] | None, level: str, line: str, cure: str | None
+    recognition: Recognition | None, registration: JsonObject | None, level: str, line: str, cure: str | None
 ) -> None:
-    summary: dict[str, Any] = {} if recognition is None else {"recognition": recognition.facts()}
+    summary = {} if recognition is None else {"recognition": recognition.facts()}
     found = trust(summary if registration is None else {**summary, "registration": registration})
     verdict = f"{VERDICTS[found.level]}: {found.why}.".replace("\N{NO-BREAK SPACE}", " ")
     assert (found.level, found.cure) == (level, cure) and verdict.startswith(line)
@@ -273,7 +274,7 @@ def write_evaluation(folder: Path, picture: np.ndarray) -> str:
 
 
 def test_the_page_of_an_evaluation_holds_every_figure_and_nothing_from_outside(tmp_path: Path) -> None:
-    page = write_evaluation(tmp_path, np.zeros((8, 8, 3), dtype=np.uint8))
+    page = write_evaluation(tmp_path, np.zeros((8, 8, 3), np.uint8))
     words = re.sub(r"<[^>]+>", " ", re.sub(r"<style>.*?</style>", "", page, flags=re.DOTALL))
     for text in ("0.912", "0.812", "0.700", "0.950", "seed: 1000000", "100^3 cells", "90.0", "25.0", "75.0"):
         assert text in words, text
@@ -294,7 +295,7 @@ def test_the_page_of_an_evaluation_holds_every_figure_and_nothing_from_outside(t
 
 
 def test_a_large_picture_becomes_small_enough(tmp_path: Path) -> None:
-    noise = np.random.default_rng(0).integers(0, 256, size=(2400, 2400, 3), dtype=np.uint8)
+    noise = default_rng(0).integers(0, 256, size=(2400, 2400, 3), dtype=np.uint8)
     page = write_evaluation(tmp_path, noise)
     assert (tmp_path / "errors.png").stat().st_size > BUDGET_BYTES
     assert 1_000_000 < (tmp_path / "r.html").stat().st_size <= BUDGET_BYTES

@@ -107,7 +107,7 @@ def test_observed_points_have_the_segment_they_lie_on(found: Reconstruction) -> 
     assert_array_equal(cloud.labels, np.repeat([1, 2], 600))
     assert_allclose(cloud.occupancy[cloud.points[:, 1] < 0.22], 0.5, atol=0.01)
     assert_array_equal(cloud.points, view())
-    logits = np.log(np.array([[0.5, 0.4, 0.1], [0.98, 0.005, 0.015]], dtype=np.float32))
+    logits = np.log(np.array([[0.5, 0.4, 0.1], [0.98, 0.005, 0.015]], np.float32))
     cloud = segment_points(logits, np.zeros((2, 3)), NAMES, PALETTE[:2])
     assert_array_equal(cloud.labels, [1, 2])
     assert_allclose(cloud.confidence, [0.8, 0.75], rtol=1e-5)
@@ -166,7 +166,7 @@ def test_a_reconstruction_is_nested_as_the_model_is_and_the_inner_segment_owns_i
     solids = Solids(result.surfaces)
     places = result.labels.positions(voxels)
     assert solids.inside(0, places).all() and solids.inside(1, places).all()
-    assert np.array_equal(solids.label(places), np.ones(len(places), dtype=np.uint8))
+    assert np.array_equal(solids.label(places), np.ones(len(places), np.uint8))
 
 
 def test_files_show_the_inner_segment_through_the_outer_one(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from cluster_work import die, die_once, fail_on_three, report, square, wait_long
+from folder_contents import run_mereo
 from scene_files import write_bar
 
 from mereo import __main__ as command_line
@@ -70,7 +71,7 @@ def test_other_machines_cannot_reach_it(cluster: Cluster, monkeypatch: pytest.Mo
 
 
 def test_items_are_taken_as_they_are_needed(cluster: Cluster) -> None:
-    taken: list[int] = []
+    taken = []
 
     def numbers() -> Iterator[int]:
         for number in range(100):
@@ -176,10 +177,10 @@ def test_a_wrong_address_is_one_sentence(
     with socket.socket() as taken:  # nobody listens there
         taken.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{taken.getsockname()[1]}"
-        assert command_line.main([*command.split(), address]) == 2
+        assert run_mereo(*command.split(), address) == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert said.startswith(f"mereo: error: there is no Ray cluster at '{address}' (") and "HOST:PORT" in said
-    assert command_line.main([*command.split(), "ray://host:10001"]) == 2
+    assert run_mereo(*command.split(), "ray://host:10001") == 2
     assert "give local, auto, or the HOST:PORT that" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -216,7 +217,7 @@ def test_objects_of_a_folder(tmp_path: Path) -> None:
 def test_a_failed_object_stops_no_other_and_the_same_call_continues(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    learnt: list[str] = []
+    learnt = []
 
     def learn(files: list[Path], output: Path, config: LearnConfig) -> dict[str, object]:
         learnt.append(output.name)

@@ -22,6 +22,7 @@ from angle import write_angle
 from browser import until
 from folder_contents import contents, read_json
 from many_frames import content, frames, loads, run
+from numpy.random import default_rng
 from toy_data import SMALL
 from toy_scene import toy_scene
 
@@ -115,7 +116,7 @@ def test_workers_change_no_bit(workers: int, whole: dict[str, bytes], tmp_path: 
 
 def test_nodes_that_die_lose_nothing(nodes: tuple[Any, str], whole: dict[str, bytes], tmp_path: Path) -> None:
     """Up to ten times a worker is killed, or a node, which another one then replaces."""
-    output, killed, rng = tmp_path / "data", list[str](), np.random.default_rng(7)
+    output, killed, rng = tmp_path / "data", list[str](), default_rng(7)
     made_nodes, place = nodes
     work = partial(generate, toy_scene(), output, SMALL, examples=EXAMPLES, seed=3, ray=made_nodes.address)
     with ThreadPoolExecutor(1) as thread:  # nodes can be started in the main thread alone
@@ -164,7 +165,7 @@ def without_seconds(value: Any) -> Any:
 
 
 def test_scores_are_those_of_one_process(rope: Model, tmp_path: Path) -> None:
-    places: dict[str, int | Cluster] = {"here": 1, "one": Cluster(local_cpus=1), "two": Cluster(local_cpus=2)}
+    places = {"here": 1, "one": Cluster(local_cpus=1), "two": Cluster(local_cpus=2)}
     for name, workers in places.items():
         config = EvaluationConfig(examples=5, cells=24, method="modes")
         evaluate_weights(rope, tmp_path / name, config, workers=workers)

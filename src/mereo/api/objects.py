@@ -22,7 +22,7 @@ from mereo.geometry.conventions import LengthUnit, Names, Range, Way
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import check_value
 from mereo.io.config import MeshesConfig, RobotMeshes
-from mereo.io.errors import checked_path
+from mereo.io.errors import AnyPath, checked_path
 from mereo.io.extras import network_needed
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.point_arrays import mesh_of
@@ -203,7 +203,7 @@ def load_object(
     check_names(inference, OPTIONS)
     meshes, computing = MeshesConfig(units, deformations, robot_meshes), InferenceConfig(**inference)
     network = weights if source is None else source
-    if isinstance(network, Trained) or (isinstance(network, str | Path) and (source is None or is_weights(network))):
+    if isinstance(network, Trained) or (isinstance(network, AnyPath) and (source is None or is_weights(network))):
         if source is not None and weights is not None:
             raise ValueError(f"{source} has weights, and weights are named too: name one of them")
         _check_meshless(network.name if isinstance(network, Trained) else network, meshes)
@@ -228,7 +228,7 @@ def load_object(
     return Object(loaded, scene)
 
 
-def load_weights(given: Trained | str | Path, inference: InferenceConfig) -> Trained:
+def load_weights(given: Trained | AnyPath, inference: InferenceConfig) -> Trained:
     """Weights by their name or file, on the device and in the precision that are asked for; loaded ones as they are.
 
     Raises as ``models.weights.load_model`` does, and ``ImportError`` without the extra `network`.
@@ -262,7 +262,7 @@ def object_of(given: Source, joints: object = None, **options: Any) -> Object:
     return known if joints is None else known.with_joints(joints)
 
 
-def _learned_scene(weights: Trained | str | Path) -> str | None:
+def _learned_scene(weights: Trained | AnyPath) -> str | None:
     """Scene of the folder of weights that ``mereo learn`` has written, as far as its file is still there."""
     scene = None if isinstance(weights, Trained) else scene_of_folder(Path(weights))
     return scene if scene is not None and (scene in SCENES or Path(scene).is_file()) else None
@@ -301,8 +301,8 @@ def _scene(source: Source, meshes: MeshesConfig) -> Scene:
     assert not isinstance(source, Trained)
     if (mesh := mesh_of(source)) is not None:
         return _scene_in_memory(mesh, meshes)
-    given: Sequence[object] = [source] if isinstance(source, str | Path) else source
-    if not isinstance(given, Sequence) or not all(isinstance(file, str | Path) and str(file) for file in given):
+    given = [source] if isinstance(source, AnyPath) else source
+    if not isinstance(given, Sequence) or not all(isinstance(file, AnyPath) and str(file) for file in given):
         raise ValueError(
             f"the object is {repr(source)[:80]}; it must be the path of a file or folder, a list of such paths, the "
             "name of a scene, a scene, or meshes with vertices and faces: name its meshes"

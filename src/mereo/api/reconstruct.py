@@ -22,8 +22,10 @@ from mereo.fitting.config import AnswerMethod
 from mereo.geometry.camera import DepthImage
 from mereo.geometry.conventions import CloudAxes
 from mereo.geometry.transforms import checked_pose
+from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import Instances
 from mereo.io.config import InputConfig
+from mereo.io.errors import AnyPath
 from mereo.io.point_arrays import depth_values, is_frame_list, mask_image, points_of
 from mereo.io.readers import mask_of_image, masked_depth, read_pose
 from mereo.io.ros_recordings import is_recording
@@ -108,7 +110,7 @@ def load_frame(
     """
     check_names(options, FRAME_OPTIONS, PLACES)
     values = (mask_value,) if isinstance(mask_value, int) else mask_value
-    if mask is not None and not isinstance(mask, str | Path):
+    if mask is not None and not isinstance(mask, AnyPath):
         image = mask_image(mask)
         frame = load_frame(source, axes=axes, intrinsics=intrinsics, camera_pose=camera_pose, **options)
         if frame.whole is None:
@@ -117,12 +119,12 @@ def load_frame(
         depth = masked_depth(frame.whole, frame.path, mask_of_image(image, size, values))
         return replace(frame, depth=depth, cloud=depth.to_points())
     mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
-    is_file = isinstance(intrinsics, str | Path)
+    is_file = isinstance(intrinsics, AnyPath)
     options |= {"frame": axes_or_camera, "mask": mask, "mask_value": values}
     reading, pose = InputConfig(intrinsics=Path(intrinsics) if is_file else None, **options), None
     if camera_pose is not None:
-        pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, str | Path) else checked_pose(camera_pose)
-    if not isinstance(source, str | Path):
+        pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, AnyPath) else checked_pose(camera_pose)
+    if not isinstance(source, AnyPath):
         frame = _frame_in_memory(source, axes, intrinsics, reading)
         return in_camera(frame, reading, pose)
     path = Path(source)
@@ -159,7 +161,7 @@ def _frame_in_memory(source: object, axes: CloudAxes | None, intrinsics: Any, re
     return SensorFrame(CLOUD, observed, unit_m, reading.frame, invalid=invalid)
 
 
-def split_options(isolation: Any, options: dict[str, Any]) -> tuple[IsolationConfig, dict[str, Any]]:
+def split_options(isolation: Any, options: JsonObject) -> tuple[IsolationConfig, JsonObject]:
     """Settings of isolation, with what of ``options`` is a field of them, and the other options."""
     if not isinstance(isolation, IsolationConfig | Mapping | None):
         raise ValueError(
@@ -172,7 +174,7 @@ def split_options(isolation: Any, options: dict[str, Any]) -> tuple[IsolationCon
     return replace(stated, **changes), options
 
 
-def observation_of(frame: Any, isolation: IsolationConfig, reading: dict[str, Any]) -> Observation:
+def observation_of(frame: Any, isolation: IsolationConfig, reading: JsonObject) -> Observation:
     """Object in a frame, whatever holds it."""
     if isinstance(frame, Observation) and replace(isolation, keep_all=False) != IsolationConfig():
         raise ValueError("isolation is given for an object that is isolated already: give it to find_object")
@@ -244,7 +246,7 @@ def reconstruct(
     are_many = is_frame_list(frame) or (
         isinstance(frame, list | tuple) and any(isinstance(each, SensorFrame | Observation) for each in frame)
     )
-    instances: Instances = options.pop("instances", 1)
+    instances = options.pop("instances", 1)
     with python_words():
         isolation, reading = split_options(isolation, options)
         known = object_of(object, **{name: reading.pop(name) for name in ("joints", *OPTIONS) if name in reading})

@@ -22,20 +22,21 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.typing import ArrayLike
 
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.conventions import Names
+from mereo.geometry.conventions import Facts, Names, WholeNumbers
 from mereo.geometry.labels import LabelGrid
-from mereo.geometry.mesh import Segment, SegmentedMesh
+from mereo.geometry.mesh import EMPTY_MESH, Segment, SegmentedMesh
 from mereo.geometry.transforms import Vector, checked_pose, inverse_rigid, rigid, transform_points
-from mereo.io.atomic_files import atomic_file, new_directory, to_json
+from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, to_json
 from mereo.io.attachments import Attachment, Content, PoseTable, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.bounds import Port, check_value
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.errors import checked_path, readable
+from mereo.io.errors import AnyPath, checked_path, readable
 from mereo.io.mesh_formats import read_glb
 from mereo.io.point_arrays import mesh_of, model_points, parts_of_scene
 from mereo.io.readers import read_arrays
@@ -43,9 +44,9 @@ from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import WRITERS, chosen_formats
 from mereo.io.writers.volumes import MM_PER_M
-from mereo.reconstruction.pipeline import Reconstruction
+from mereo.reconstruction.pipeline import Reconstruction, described
 from mereo.results.carry import carry, place
-from mereo.results.joints import JointValue, measure_joints, pose_covariance
+from mereo.results.joints import JointValue, JointValues, measure_joints, pose_covariance
 from mereo.visualization.reconstruction_report import result_html
 from mereo.visualization.result_files import (
     INSTANCE,
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
 
     from mereo_viewer.server import OpenPage
 
-Pose = Float[np.ndarray, "4 4"]
+Pose = Float[ndarray, "4 4"]
 
 
 Entry = TypeVar("Entry")
@@ -132,9 +133,11 @@ class SegmentResult:
         return mesh
 
     def __repr__(self) -> str:
-        sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
-        figures = f"volume {self.volume:.3g}{sure}" if self.is_present else "not found"
-        return f"SegmentResult({self.name!r}, {figures})"
+        return described(self, self.is_present)
+
+
+SegmentResults = dict[str, SegmentResult]
+"""Segments of a result by their names."""
 
 
 def _open3d_mesh(mesh: Segment) -> Any:
@@ -151,7 +154,7 @@ class SegmentedResult(ABC):
 
     @property
     @abstractmethod
-    def _segments(self) -> dict[str, SegmentResult]:
+    def _segments(self) -> SegmentResults:
         """All segments by their names."""
 
     @property
@@ -279,7 +282,7 @@ class Result(Answer, SegmentedResult):
         return None if self.registered is None else self.registered.pose()
 
     @cached_property
-    def covariance(self) -> Float[np.ndarray, "6 6"] | None:
+    def covariance(self) -> Float[ndarray, "6 6"] | None:
         """Covariance of ``pose``: a turn in radians, then a shift in the frame's unit; None without a fit.
 
         Both in the frame's axes: the true pose is ``[exp(turn) R, p + shift]`` where ``pose`` is ``[R, p]``; p is where
@@ -299,7 +302,7 @@ class Result(Answer, SegmentedResult):
         return None if self.registered is None else self.registered.residual
 
     @property
-    def joints(self) -> dict[str, JointValue]:
+    def joints(self) -> JointValues:
         """Value of each joint that the object's definition has by name, as a robot's file has; empty without a fit."""
         return measure_joints(self)
 
@@ -309,14 +312,14 @@ class Result(Answer, SegmentedResult):
         return None if self.registered is None else self.registered.model_scale
 
     @cached_property
-    def _segments(self) -> dict[str, SegmentResult]:
+    def _segments(self) -> SegmentResults:
         fit, parts = self.registered, self.reconstruction.segments
         sure = None if fit is None else fit.uncertainty
         radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
         poses = {} if fit is None else {part.name: fit.segment_pose(part.label) for part in parts}
         return _segment_results(parts, self.surfaces, radii, poses)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """Figures as in ``summary.json``, in plain types: numbers, texts, lists, None for NaN.
 
         Of a lost object without an answer they have no segments, and ``recognition`` says why.
@@ -359,7 +362,7 @@ class Result(Answer, SegmentedResult):
         (placed,) = place([attachment], self.registrar, files)
         carried = carry(placed, registered)
         content = carried.content
-        if isinstance(what, str | Path):
+        if isinstance(what, AnyPath):
             return CarriedFile(carried.name, content, carried.inside, carried.farthest, self.seen.frame)
         if isinstance(content, PoseTable):
             assert content.rotations is not None
@@ -453,12 +456,12 @@ def _check_list(formats: object) -> None:
         raise ValueError(f"formats is {formats!r}; it must be a list of names: give for example ('glb', 'json')")
 
 
-def free_folder(name: str = "result") -> Path:
-    """Path of the first of NAME, NAME2, NAME3, ... that is not there."""
+def free_folder() -> Path:
+    """Path of the first of result, result2, result3, ... that is not there."""
     numbers = count(2)
-    path = Path(name)
+    path = Path("result")
     while path.exists() or path.is_symlink():
-        path = Path(f"{name}{next(numbers)}")
+        path = Path(f"result{next(numbers)}")
     return path
 
 
@@ -519,7 +522,7 @@ class CarriedFile:
 
 
 def _attachment(what: Any) -> Attachment:
-    if isinstance(what, str | Path):
+    if isinstance(what, AnyPath):
         return read_attachments([what])[0]
     if (mesh := mesh_of(what)) is not None:
         return Attachment("the mesh", Surfaces(mesh))
@@ -529,7 +532,7 @@ def _attachment(what: Any) -> Attachment:
     return Attachment("the points", Positions(model_points([what] if _shape(what) == (3,) else what)))
 
 
-def _shape(what: Any) -> tuple[int, ...]:
+def _shape(what: Any) -> WholeNumbers:
     """Shape of an array or list; empty of what is none."""
     with suppress(ValueError):  # of rows that differ in length
         return np.shape(what) if hasattr(what, "ndim") or isinstance(what, list | tuple) else ()
@@ -564,8 +567,8 @@ def registration_of(answer: Answer) -> Registration:
 
 
 def _segment_results(
-    parts: Iterable[Any], surfaces: SegmentedMesh, radii: Mapping[str, Any], poses: Mapping[str, Pose]
-) -> dict[str, SegmentResult]:
+    parts: Iterable[Any], surfaces: SegmentedMesh, radii: Facts, poses: Mapping[str, Pose]
+) -> SegmentResults:
     """Segments by their names, of figures as ``SegmentFacts`` has them; radii and poses are those that are known."""
     return {
         part.name: SegmentResult(
@@ -587,7 +590,7 @@ def _segment_results(
 
 
 def _numbers(values: Any) -> Any:
-    return None if values is None else np.array(values, dtype=np.float64)
+    return None if values is None else np.array(values, float)
 
 
 def _fact(*keys: str, read: Callable[[Any], Any] = lambda value: value) -> Any:
@@ -613,7 +616,7 @@ class StoredResult(SegmentedResult):
         further: results of further instances of the object in the same frame.
     """
 
-    facts: dict[str, Any]
+    facts: JsonObject
     surfaces: SegmentedMesh | None
     labels: LabelGrid | None
     further: "tuple[StoredResult, ...]" = ()
@@ -628,7 +631,7 @@ class StoredResult(SegmentedResult):
         return self, *self.further
 
     @property
-    def joints(self) -> dict[str, JointValue]:
+    def joints(self) -> JointValues:
         """As ``Result.joints``."""
         return {
             name: JointValue(
@@ -638,7 +641,7 @@ class StoredResult(SegmentedResult):
         }
 
     @cached_property
-    def _segments(self) -> dict[str, SegmentResult]:
+    def _segments(self) -> SegmentResults:
         rows = self.facts["segments"]
         radii = {row["name"]: row.get("centroid_radius95") for row in rows}
         poses = {row["name"]: np.array(row["pose"]) for row in rows if "pose" in row}
@@ -646,7 +649,7 @@ class StoredResult(SegmentedResult):
             return {}
         return _segment_results((SimpleNamespace(**row) for row in rows), self.surfaces, radii, poses)
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> JsonObject:
         """As ``Result.to_dict``."""
         return deepcopy(self.facts)
 
@@ -674,9 +677,8 @@ def load_result(folder: str | Path) -> StoredResult:
         facts = json.loads(summary.read_text("utf-8"))
         if grid.names != tuple(row["name"] for row in facts["segments"]) or not meshes.keys() <= set(grid.names):
             raise ValueError(f"its segments are not those of {surfaces.name} and {labels.name}")
-        empty = np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
         parts = (
-            meshes.get(row["name"], Segment(row["name"], tuple(row["color"]), *empty)) for row in facts["segments"]
+            meshes.get(row["name"], Segment(row["name"], tuple(row["color"]), *EMPTY_MESH)) for row in facts["segments"]
         )
         mesh = SegmentedMesh(tuple(parts), tuple(map(tuple, facts["nested"])))
         result = StoredResult(facts, mesh, grid)

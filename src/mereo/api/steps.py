@@ -11,16 +11,17 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from mereo.api.words import python_words, with_changes
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import LengthUnit
 from mereo.geometry.metrics import format_score
+from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import Positive, check_value
 from mereo.io.errors import checked_path
 from mereo.io.object_storage import ObjectPath, place_of
-from mereo.models.config import EXACT, Device, InferenceConfig
+from mereo.models.config import EXACT, Device, ExportFormat, InferenceConfig
 from mereo.models.export.onnx_export import export_weights
 from mereo.models.model import Model
 from mereo.models.weights import load_for, settings_for
@@ -99,7 +100,7 @@ def evaluate(
 
 
 def export(
-    model: Model | str | Path, output: str | Path, format: Literal["onnx", "torch"] = "onnx", overwrite: bool = False
+    model: Model | str | Path, output: str | Path, format: ExportFormat = "onnx", overwrite: bool = False
 ) -> Path:
     """Folder with a network as two graphs, encoder and query, for other runtimes: `mereo export`.
 
@@ -113,7 +114,7 @@ def export(
     with content unless ``overwrite``.
     """
     with python_words():
-        check_value("format", format, Literal["onnx", "torch"], "onnx")
+        check_value("format", format, ExportFormat, "onnx")
         export_weights(model, output, format, overwrite)
     return Path(output)
 
@@ -138,7 +139,7 @@ class Learned:
     frame: Path
     report: Path | None
     method: AnswerMethod
-    metrics: dict[str, Any]
+    metrics: JsonObject
 
     @property
     def iou(self) -> float:

@@ -6,10 +6,10 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import fields, replace
 from difflib import get_close_matches
-from typing import Any, TypeVar, get_args
+from typing import TypeVar, get_args
 
 from mereo.fitting.config import AnswerMethod
-from mereo.geometry.conventions import Names
+from mereo.geometry.conventions import Facts, Names
 from mereo.io.config import CarryFrame
 from mereo.reconstruction.config import Extent
 
@@ -98,7 +98,7 @@ def check_names(given: Iterable[str], known: Collection[str], places: Mapping[st
         raise TypeError(f"there is no option {name!r} here: {cure}")
 
 
-def with_changes(settings: Settings, changes: Mapping[str, Any]) -> Settings:
+def with_changes(settings: Settings, changes: Facts) -> Settings:
     """Settings with some fields changed; raises ``TypeError`` as ``check_names``, and as the settings' own checks."""
     check_names(changes, names_of(type(settings)))
     return replace(settings, **changes)  # type: ignore[type-var]

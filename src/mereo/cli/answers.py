@@ -9,11 +9,11 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import UseAppendAction
 
-from mereo.cli.options import ConfigFile, FrameOptions, InputName, InputOrNone, Inputs, loaded_object
+from mereo.cli.options import ConfigFile, FrameOptions, InputName, InputOrNone, Inputs, Paths, loaded_object
 from mereo.fitting.config import AnswerMethod, StreamMethod
-from mereo.io.bounds import Cells, Instances, Port, Positive, Threads, Workers
+from mereo.io.bounds import GROUP, Cells, Instances, Port, Positive, Threads, Workers
 from mereo.io.config import CarryFrame, FilesConfig
 from mereo.models.config import InferenceConfig
 from mereo.workers.spread import DEFAULT_TASK, RayAddress, TaskResources
@@ -74,17 +74,17 @@ class ReconstructCommand(FrameOptions):
     inputs: Inputs
     output: Path | None = None
     resolution: Cells = 128
-    files: Annotated[FilesConfig, arg(name="")] = field(default_factory=FilesConfig)
+    files: Annotated[FilesConfig, GROUP] = field(default_factory=FilesConfig)
     method: AnswerMethod = "auto"
     scene: str | None = None
     initial_pose: Path | None = None
     instances: Instances = 1
-    carry: UseAppendAction[tuple[Path, ...]] = ()
+    carry: UseAppendAction[Paths] = ()
     carry_frame: CarryFrame = "source"
     force: bool = False
     threads: Threads = 0
     ray: RayAddress = None
-    task: Annotated[TaskResources, arg(name="")] = DEFAULT_TASK
+    task: Annotated[TaskResources, GROUP] = DEFAULT_TASK
     json: bool = False
     options_from: ConfigFile = None
 
@@ -215,8 +215,8 @@ class ServeCommand:
     port: Port = 8000
     host: str = "127.0.0.1"
     resolution: Cells = 128
-    limits: Annotated[ServeConfig, arg(name="")] = field(default_factory=ServeConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    limits: Annotated[ServeConfig, GROUP] = field(default_factory=ServeConfig)
+    inference: Annotated[InferenceConfig, GROUP] = field(default_factory=InferenceConfig)
     workers: Workers = 0
 
     def run(self) -> None:

@@ -1,9 +1,9 @@
 """The command ``mereo demo``: a real scan by its object's meshes alone, and frames by shipped weights."""
 
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 from mereo.cli.options import Outcome
@@ -55,13 +55,13 @@ class Demo:
         from mereo.models.weights_place import has_network
 
         check_place(self.output, may_be_link=True)
-        scores, began = JsonObject(), time.perf_counter()
+        scores, began = JsonObject(), perf_counter()
         for name, title, known, frame, truth in _inputs(self.output):
-            folder, started = self.output / name, time.perf_counter()
+            folder, started = self.output / name, perf_counter()
             check_new_directory(folder, force=True)
             with shown_stages():
                 result = reconstruct(frame, known, resolution=RESOLUTION)
-                seconds = time.perf_counter() - started
+                seconds = perf_counter() - started
                 result.save(folder, overwrite=True)
             scores[name] = {"output": str(folder), **_print_scores(title, result, truth), "seconds": seconds}
             page = f", or in the browser: mereo view {folder}" if result.taken else ""
@@ -71,14 +71,14 @@ class Demo:
                 "The extra `network` is not installed, so nothing is shown of networks, which start the fit at once:\n"
                 "run pip install 'mereo[network]' and this again.\n"
             )
-        print(f"All in {time.perf_counter() - began:.0f} s.")
+        print(f"All in {perf_counter() - began:.0f} s.")
         print(NEXT.format(frame=self.output / FRAME, meshes=self.output / MESHES))
         return Outcome(scores)
 
 
 def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, TruthGrid]]":
     """Name, title, object, frame and truth of each input; the first one's frame and meshes are written."""
-    import numpy as np
+    from numpy.linalg import inv
 
     from mereo.api.objects import load_object
     from mereo.api.reconstruct import load_frame
@@ -94,8 +94,8 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
 
     model = statistical_model_in("bunny")
     assert model.source_frame is not None
-    rest = model.rest.transformed(np.linalg.inv(model.source_frame.T_scene_source))  # as in its files, metres
-    frame, truth = load_frame(SHIPPED_SCAN), truth_grid(rest.transformed(np.linalg.inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
+    rest = model.rest.transformed(inv(model.source_frame.T_scene_source))  # as in its files, metres
+    frame, truth = load_frame(SHIPPED_SCAN), truth_grid(rest.transformed(inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
     with new_directory(output / FRAME.parent, force=True) as folder:
         points = frame.cloud.points
         seen = transform_points(into_camera(points, frame.axes), points)

@@ -12,7 +12,7 @@ ASSET    a name from `mereo assets list`
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
@@ -21,7 +21,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 from tyro.conf import Positional, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
-from mereo.io.bounds import check_values
+from mereo.geometry.conventions import Facts, Names
+from mereo.io.atomic_files import JsonObject
+from mereo.io.bounds import GROUP, check_values
 from mereo.io.config import InputConfig, MeshesConfig
 from mereo.io.errors import AnyPath
 from mereo.io.object_storage import Place, place_of
@@ -41,7 +43,7 @@ class Outcome:
         status: exit status.
     """
 
-    facts: Mapping[str, Any]
+    facts: Facts
     status: int = 0
 
 
@@ -70,18 +72,17 @@ PlaceOption = Annotated[
 ]
 """Local path or URL of an object storage, of which ``Path`` would make s3:/bucket."""
 
+Paths = tuple[Path, ...]
 SceneName = Annotated[Positional[str], arg(metavar="SCENE")]
-ObjectFiles = Annotated[
-    Positional[tuple[Path, ...]], arg(metavar="OBJECT [OBJECT ...]", help_behavior_hint="(required)")
-]
+ObjectFiles = Annotated[Positional[Paths], arg(metavar="OBJECT [OBJECT ...]", help_behavior_hint="(required)")]
 DatasetFolder = Annotated[Positional[PlaceOption], arg(metavar="DATASET")]
 WeightsName = Annotated[Positional[str], arg(metavar="WEIGHTS")]
-WeightsFiles = Annotated[Positional[tuple[Path, ...]], arg(metavar="[WEIGHTS ...]", help_behavior_hint="")]
-Inputs = Annotated[Positional[tuple[Path, ...]], arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
+WeightsFiles = Annotated[Positional[Paths], arg(metavar="[WEIGHTS ...]", help_behavior_hint="")]
+Inputs = Annotated[Positional[Paths], arg(metavar="INPUT [INPUT ...]", help_behavior_hint="(required)")]
 InputOrNone = Annotated[Positional[Path | None], arg(metavar="[INPUT]", help_behavior_hint="")]
 InputName = Annotated[Positional[str], arg(metavar="INPUT")]
 ScanCloud = Annotated[Positional[Path], arg(metavar="SCAN")]
-AssetNames = Annotated[Positional[tuple[str, ...]], arg(metavar="[ASSET ...]", help_behavior_hint="")]
+AssetNames = Annotated[Positional[Names], arg(metavar="[ASSET ...]", help_behavior_hint="")]
 
 ConfigFile = Annotated[Path | None, arg(name="config")]
 """Option of commands that read their options from a file."""
@@ -104,13 +105,13 @@ class FrameOptions:
         inference: where and how exactly the network computes.
     """
 
-    object: tuple[str, ...] = ()
+    object: Names = ()
     weights: str | None = None
-    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
+    meshes: Annotated[MeshesConfig, GROUP] = field(default_factory=MeshesConfig)
     joints: Path | None = None
-    reading: Annotated[InputConfig, arg(name="")] = field(default_factory=InputConfig)
-    isolation: Annotated[IsolationConfig, arg(name="")] = field(default_factory=IsolationConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = field(default_factory=InferenceConfig)
+    reading: Annotated[InputConfig, GROUP] = field(default_factory=InputConfig)
+    isolation: Annotated[IsolationConfig, GROUP] = field(default_factory=IsolationConfig)
+    inference: Annotated[InferenceConfig, GROUP] = field(default_factory=InferenceConfig)
 
 
 def check_named(command: str, object: Sequence[str], weights: AnyPath | None) -> None:
@@ -135,7 +136,7 @@ def loaded_object(command: FrameOptions, inference: InferenceConfig | None = Non
     object, scene, inference = command.object, getattr(command, "scene", None), inference or command.inference
     if object and scene is not None:
         raise ValueError(f"--scene is {scene}, but --object says what the object is: leave one of them out")
-    source: Any = (object[0] if len(object) == 1 else list(object)) or None
+    source = (object[0] if len(object) == 1 else list(object)) or None
     return object_of(
         load_scene(source) if source in SCENES else source,
         command.joints,
@@ -168,7 +169,7 @@ NOT_RESULT = (
 """Fields of which a result is independent: a command does not write them into its file, but reads them from one."""
 
 
-def read_options(path: Path, command: str) -> dict[str, Any]:
+def read_options(path: Path, command: str) -> JsonObject:
     """Options of a file for a command, by name, those of groups as ``network.width``.
 
     Raises ``FileNotFoundError``, and ``ValueError`` for what is no mapping of names and for another command's options.
@@ -204,7 +205,7 @@ def flat_options(values: dict[Any, Any], prefix: str = "") -> Iterator[tuple[str
             yield name, value
 
 
-def with_options(command: Any, options: dict[str, Any], path: Path) -> Any:
+def with_options(command: Any, options: JsonObject, path: Path) -> Any:
     """Copy of a command with the options of a file; ``ValueError`` for a wrong name or value names the file."""
     known = list[str]()
     try:
@@ -218,10 +219,10 @@ def with_options(command: Any, options: dict[str, Any], path: Path) -> Any:
     return changed
 
 
-def _replaced(settings: Any, options: dict[str, Any], prefix: str, known: list[str]) -> Any:
+def _replaced(settings: Any, options: JsonObject, prefix: str, known: list[str]) -> Any:
     from pydantic import TypeAdapter, ValidationError
 
-    changes = dict[str, Any]()
+    changes = JsonObject()
     for attribute, name, kind, value in _items(settings, prefix):
         if is_dataclass(value):
             changes[attribute] = _replaced(value, options, name, known)
@@ -248,13 +249,13 @@ def _items(settings: Any, prefix: str) -> Iterator[tuple[str, str, Any, Any]]:
         yield attribute, prefix + name + "." * (is_dataclass(value) and name != ""), kind, value
 
 
-def options_of(command: Any, name: str) -> dict[str, Any]:
+def options_of(command: Any, name: str) -> JsonObject:
     """Content of the file of options of a command that runs: all that decides its result, files by absolute paths."""
     return {"command": name, **_stated(command)}
 
 
-def _stated(settings: Any) -> dict[str, Any]:
-    stated = dict[str, Any]()
+def _stated(settings: Any) -> JsonObject:
+    stated = JsonObject()
     for attribute, name, _, value in _items(settings, ""):
         if attribute in NOT_RESULT:
             continue

@@ -234,7 +234,7 @@ def folder_names(files: Sequence[Path]) -> list[str]:
 
     Raises ``ValueError`` where no name does, because files of one name lie in folders of one name.
     """
-    kinds: tuple[Callable[[Path], str], ...] = (
+    kinds = (
         lambda file: file.stem,
         lambda file: file.name,
         lambda file: f"{file.resolve().parent.name}-{file.name}",
@@ -264,7 +264,7 @@ def reconstruct_frames(files: Sequence[Path], output: Path, job: FrameJob, clust
         )
     job.check()
     _ = job.object, job.placed  # what is wrong with them is no frame's fault
-    summaries: dict[Path, Summary | None] = {}
+    summaries = dict[Path, Summary | None]()
     started = time.monotonic()
     with warnings.catch_warnings():
         warnings.filterwarnings("always", category=FrameWarning)  # for each frame, also in the same words

@@ -5,10 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import arg
-
 from mereo.cli.options import AssetNames, ObjectFiles, SceneName
-from mereo.io.bounds import Aperture, CountOrNone, States
+from mereo.io.bounds import GROUP, Aperture, CountOrNone, States
 from mereo.io.config import MeshesConfig
 from mereo.synthesis.config import SENSORS, Sensor, SequenceConfig
 
@@ -50,7 +48,7 @@ class SceneNew:
     files: ObjectFiles
     output: Path | None = None
     aperture: Aperture = 360.0
-    meshes: Annotated[MeshesConfig, arg(name="")] = field(default_factory=MeshesConfig)
+    meshes: Annotated[MeshesConfig, GROUP] = field(default_factory=MeshesConfig)
 
     def run(self) -> None:
         """Write the scene file, and print what was found and what to do next."""
@@ -215,7 +213,7 @@ class SceneRecord:
 
     scene: SceneName
     output: Path
-    settings: Annotated[SequenceConfig, arg(name="")] = field(default_factory=SequenceConfig)
+    settings: Annotated[SequenceConfig, GROUP] = field(default_factory=SequenceConfig)
     sensor: Sensor = "paper"
     seed: CountOrNone = 0
     test: bool = False

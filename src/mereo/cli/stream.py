@@ -21,6 +21,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import SynchronousExecutor
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import CloudAxes, Pair, Texts
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import owned_centroids
 from mereo.geometry.transforms import Transform, Vector
@@ -125,7 +126,7 @@ def stream(
     """
     source = _paced(frames) if recorded_pace else iter(frames)
     each = ((frame, time.perf_counter(), 0) for frame in source if frame is not None)
-    arriving: Generator[Arrived, None, None] = each if every_frame else _latest(source)
+    arriving = each if every_frame else _latest(source)
     with closing(arriving):
         for frame, arrived_s, dropped in arriving:
             start, result, error = time.perf_counter(), None, ""
@@ -209,7 +210,7 @@ class Summary:
 
     def __str__(self) -> str:
         rate_hz = self.answered / (time.perf_counter() - self.start_s)
-        median, worst = np.quantile(self.latencies_s, [0.5, 0.99]) if self.latencies_s else (np.nan, np.nan)
+        median, worst = np.quantile(self.latencies_s, [0.5, 0.99]) if self.latencies_s else (nan, nan)
         return (
             f"{self.answered} frames answered at {rate_hz:.1f} Hz, latency {1e3 * median:.0f} ms (median), "
             f"{1e3 * worst:.0f} ms (99 %); {self.dropped} dropped for newer ones, {self.failed} bad"
@@ -240,14 +241,14 @@ class WatchedFolder:
     def __init__(self, folder: Path, wanted: Callable[[Path], bool]) -> None:
         self.folder, self.wanted = folder, wanted
         # of each file time and size at the last look, since when it is waited for, and those when it was handed over
-        self._seen: dict[Path, tuple[tuple[int, int], float, tuple[int, int] | None]] = {}
+        self._seen = dict[Path, tuple[Pair, float, Pair | None]]()
 
     def look(self, now_s: float) -> list[Path]:
         """Files that are complete since the last look, the oldest first; ``now_s`` is the time by any clock.
 
         Raises ``OSError`` where the folder is gone.
         """
-        before, self._seen, complete = self._seen, {}, dict[Path, tuple[int, int]]()
+        before, self._seen, complete = self._seen, {}, dict[Path, Pair]()
         for file in list(self.folder.iterdir()):
             try:
                 facts = file.stat() if self.wanted(file) else None
@@ -535,7 +536,7 @@ class Answering:
         self.uncertainty, self.radius = uncertainty, radius
         executor = SynchronousExecutor() if waits else None
         self.tracker = None if registrar is None else Tracker(registrar, executor=executor)
-        self._size: tuple[int, int] | None = None
+        self._size: Pair | None = None
 
     def __call__(self, frame: StreamFrame) -> FrameAnswer:
         """Answer to a frame; raises ``ValueError`` for unusable ones and other sizes, and where nothing is found."""
@@ -570,7 +571,7 @@ class SurfaceFolder:
 
     def __init__(self, path: Path, force: bool) -> None:
         self.path, self.force = path, force
-        self._frames: dict[str, str] = {}
+        self._frames: Texts = {}
         check_place(path, may_be_link=True)
         if path.exists() and not path.is_dir():
             raise FileExistsError(f"{path} is a file; surfaces are written into a folder: choose another --surfaces")

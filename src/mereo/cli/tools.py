@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from tyro.conf import Positional, arg
 
 from mereo.cli.options import ScanCloud
+from mereo.geometry.conventions import Names
 from mereo.io.bounds import Count, PositiveOrUnknown, Threads, Workers
 from mereo.io.cores import workers_for
 from mereo.models.config import Device, Precision
@@ -51,7 +52,7 @@ class Align:
     scene_unit_mm: PositiveOrUnknown = None
     frame: Literal["camera", "scanner"] = "camera"
     is_rigid: Annotated[bool, arg(name="rigid")] = False
-    hold: tuple[str, ...] = ()
+    hold: Names = ()
     drop_invalid: bool = False
     force: bool = False
 
@@ -147,7 +148,7 @@ class Experiment:
 
     name: Positional[Literal["list", ExperimentName]]
     scale: ScaleName = "smoke"
-    objects: tuple[str, ...] = ()
+    objects: Names = ()
     output: Path = Path("out/experiments")
     workers: Workers = 0
     threads: Threads = 0

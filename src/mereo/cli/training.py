@@ -11,6 +11,7 @@ from mereo.cli.options import (
     DatasetFolder,
     ObjectFiles,
     Outcome,
+    Paths,
     PlaceOption,
     SceneName,
     WeightsName,
@@ -18,11 +19,11 @@ from mereo.cli.options import (
     options_of,
 )
 from mereo.fitting.config import AnswerMethod
-from mereo.geometry.conventions import LengthUnit, WorkspaceName
-from mereo.io.bounds import Count, CountOrNone, ImageSize, NotNegative, Positive, Threads, Workers
+from mereo.geometry.conventions import LengthUnit, Pair, WorkspaceName
+from mereo.io.bounds import GROUP, Count, CountOrNone, ImageSize, NotNegative, Positive, Threads, Workers
 from mereo.io.config import CONFIG
 from mereo.io.cores import workers_for
-from mereo.models.config import EXACT, Device, InferenceConfig
+from mereo.models.config import EXACT, Device, ExportFormat, InferenceConfig
 from mereo.synthesis.config import GenerateConfig, Sensor, SensorConfig
 from mereo.workers.spread import DEFAULT_TASK, RayAddress, TaskResources, choose_cluster
 from mereo_learning.config import PresetName, TrainConfig
@@ -58,7 +59,7 @@ class Generate:
     resume: bool = False
     test: bool = False
     sensor: Sensor = "paper"
-    settings: Annotated[GenerateConfig, arg(name="")] = field(default_factory=GenerateConfig)
+    settings: Annotated[GenerateConfig, GROUP] = field(default_factory=GenerateConfig)
     threads: Threads = 0
     ray: RayAddress = None
     options_from: ConfigFile = None
@@ -84,7 +85,7 @@ class Generate:
         write_whole(self.output / CONFIG, json_text(options_of(self, "generate")).encode())
 
 
-def part_of(shard: str) -> tuple[int, int]:
+def part_of(shard: str) -> Pair:
     """Part and number of parts of a shard: ``"1/4"`` is part 1 of 4, counted from 0. Raises ``ValueError``."""
     part, _, parts = shard.partition("/")
     if not (part.isdecimal() and parts.isdecimal() and int(part) < int(parts)):
@@ -159,7 +160,7 @@ class Train:
     dataset: DatasetFolder
     output: Path
     preset: PresetName = "base"
-    config: Annotated[TrainConfig, arg(name="")] = field(default_factory=TrainConfig)
+    config: Annotated[TrainConfig, GROUP] = field(default_factory=TrainConfig)
     device: Device = "auto"
     threads: Threads = 0
     options_from: ConfigFile = None
@@ -207,18 +208,18 @@ class Evaluate:
     examples: Count = 128
     seed: CountOrNone = 1_000_000
     scene: str | None = None
-    scans: tuple[Path, ...] | None = None
+    scans: Paths | None = None
     sensor: Sensor = "paper"
     image_size: ImageSize = 96
     noise_std: NotNegative = 0.1
     workspace: WorkspaceName = "own"
     terms: Annotated[SensorConfig, arg(name="sensor")] = field(default_factory=SensorConfig)
-    inference: Annotated[InferenceConfig, arg(name="")] = EXACT
+    inference: Annotated[InferenceConfig, GROUP] = EXACT
     method: AnswerMethod = "auto"
     force: bool = False
     threads: Threads = 0
     ray: RayAddress = None
-    task: Annotated[TaskResources, arg(name="")] = DEFAULT_TASK
+    task: Annotated[TaskResources, GROUP] = DEFAULT_TASK
     json: bool = False
     options_from: ConfigFile = None
 
@@ -317,7 +318,7 @@ class Export:
 
     weights: WeightsName
     output: Path
-    format: Literal["onnx", "torch"] = "onnx"
+    format: ExportFormat = "onnx"
     force: bool = False
 
     def run(self) -> None:

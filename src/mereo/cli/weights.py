@@ -5,7 +5,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
-from mereo.cli.options import Outcome, WeightsFiles, WeightsName
+from mereo.cli.options import Outcome, Paths, WeightsFiles, WeightsName
 from mereo.io.bounds import Count, CountOrNone, Threads
 
 SCORES = re.compile(r"^\| ([\d.-]+) \| ([\d.-]+) \|", re.MULTILINE)
@@ -175,7 +175,7 @@ class Release:
     weights: WeightsName
     name: str
     output: Path
-    tests: tuple[Path, ...] = ()
+    tests: Paths = ()
     force: bool = False
 
     def run(self) -> None:

@@ -18,10 +18,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import permutations
+from math import inf
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.linalg import eigh
 from numpy.random import Generator, default_rng
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
@@ -37,10 +40,10 @@ from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import Flags, Values
 from mereo.io.progress import stage
 
-Modes = Float[np.ndarray, "n 3 k"]
+Modes = Float[ndarray, "n 3 k"]
 """Motion of each node in each mode."""
 
-PerMode = Float[np.ndarray, " k"]
+PerMode = Float[ndarray, " k"]
 """A number for each mode."""
 
 _CORNERS = read_only(np.argwhere(np.ones((2, 2, 2))))
@@ -73,7 +76,7 @@ class Material:
             raise ValueError(
                 f"Poisson's ratio is {self.poisson:g}; it must lie between -1 and 0.5: take 0.4 for tissue"
             )
-        if not 0 < self.young < np.inf:
+        if not 0 < self.young < inf:
             raise ValueError(f"Young's modulus is {self.young:g}; it must be above 0: take 1, which changes no mode")
 
 
@@ -90,8 +93,8 @@ class ElasticSolid:
     """
 
     mesh: Tetrahedra
-    filled: Float[np.ndarray, " m"]
-    stiffness: Float[np.ndarray, " m"] | None = None
+    filled: Float[ndarray, " m"]
+    stiffness: Float[ndarray, " m"] | None = None
 
     def __post_init__(self) -> None:
         if not ((self.filled > 0) & (self.filled <= 1)).all():
@@ -99,7 +102,7 @@ class ElasticSolid:
         object.__setattr__(self, "filled", read_only_view(self.filled))
 
     @property
-    def volumes(self) -> Float[np.ndarray, " m"]:
+    def volumes(self) -> Float[ndarray, " m"]:
         """Filled volume of each tetrahedron."""
         return np.abs(self.mesh.volumes) * self.filled
 
@@ -151,7 +154,7 @@ def build_lattice(mesh: SegmentedMesh, cells: int = 16, stiffness: Sequence[floa
         raise ValueError("the mesh has no inside: turn its faces outward, or take more cells for a thin one")
     share = sampled.mean(axis=(1, 3, 5))
     vertices = np.concatenate([segment.vertices for segment in mesh.segments])
-    touched = np.zeros(tuple(shape), dtype=bool)
+    touched = np.zeros(tuple(shape), bool)
     touched[tuple(np.clip(np.floor((vertices - origin) / size).astype(np.int64), 0, shape - 1).T)] = True
     cell = np.argwhere((share > 0) | touched)
     filled = np.maximum(share[tuple(cell.T)], 0.5 / SAMPLES**3)
@@ -196,7 +199,7 @@ def find_modes(solid: ElasticSolid, count: int, material: Material, held: Flags 
     held leaves it free to turn.
     """
     stiffness, mass = assemble_stiffness(solid, material), solid.mass
-    rigid, free = (6, np.ones(len(mass), dtype=bool)) if held is None else (0, ~held)
+    rigid, free = (6, np.ones(len(mass), bool)) if held is None else (0, ~held)
     rows = np.flatnonzero(np.repeat(free, 3))
     most = solid.most_modes(held)
     if not 1 <= count <= most:
@@ -232,7 +235,7 @@ def scale_modes(values: PerMode, modes: Modes, motion: float, power: float = 2.0
 
     Raises ``ValueError`` for a motion that is not above 0.
     """
-    if not 0 < motion < np.inf:
+    if not 0 < motion < inf:
         raise ValueError(f"the motion is {motion:g}; it must be above 0: a tenth of half the longest side is moderate")
     amplitude = (values / values[0]) ** (-power / 2)
     return modes * (amplitude * (motion / np.sqrt((amplitude**2).sum())))
@@ -267,7 +270,7 @@ class StateMap:
         """Map of one state, normal coefficients of variance 1 giving the prior's; the centre of mass stays."""
         linear = self.mesh.gradients(self.mesh.nodes + self.modes @ coefficients)
         mirrored = np.swapaxes(linear, 1, 2)
-        stretch, axes = np.linalg.eigh((linear + mirrored) / 2)
+        stretch, axes = eigh((linear + mirrored) / 2)
         strain = axes * np.exp(stretch - 1)[:, None] @ np.swapaxes(axes, 1, 2)
         spin = (linear - mirrored) / 2
         turn = Rotation.from_rotvec(np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)).as_matrix()

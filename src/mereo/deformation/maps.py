@@ -14,6 +14,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, Integer
+from numpy import ndarray
 from numpy.linalg import det, norm
 from scipy.spatial.transform import Rotation
 
@@ -70,7 +71,7 @@ class Rigid:
     @cached_property
     def _matrix(self) -> Matrix:
         """Turn as a matrix, made once: a chain of joints asks each for all links behind it."""
-        return np.asarray(Rotation.from_rotvec(self.rotation_vector).as_matrix())
+        return Rotation.from_rotvec(self.rotation_vector).as_matrix()
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,13 +128,13 @@ class Localized:
         return points + weight * (self.inner(points) - points)
 
 
-def smooth_step(t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n"]:
+def smooth_step(t: Float[ndarray, "*n"]) -> Float[ndarray, "*n"]:
     """Quintic step from 0 (t <= 0) to 1 (t >= 1) with two continuous derivatives; its slope is at most 15/8."""
     t = np.clip(t, 0.0, 1.0)
     return t * t * t * (t * (6.0 * t - 15.0) + 10.0)
 
 
-def moved_by(points: Points, owner: Integer[np.ndarray, " n"], deformations: Deformations) -> Points:
+def moved_by(points: Points, owner: Integer[ndarray, " n"], deformations: Deformations) -> Points:
     """Images of points, each by the deformation of its ``owner``'s number."""
     result = np.empty_like(points)
     for index in np.unique(owner):
@@ -154,7 +155,7 @@ def turn(
     points: Points,
     center: Vector,
     axis: Vector,
-    angle_rad: np.ndarray,
+    angle_rad: ndarray,
 ) -> Points:
     """Points turned about the line through ``center`` along the unit ``axis``, each by its own angle ("n").
 
@@ -166,7 +167,7 @@ def turn(
     return points + (np.cos(angle_rad) - 1.0)[:, None] * across + np.sin(angle_rad)[:, None] * quarter
 
 
-def crossing(vectors: PointArray) -> Float[np.ndarray, "*n 3 3"]:
+def crossing(vectors: PointArray) -> Float[ndarray, "*n 3 3"]:
     """Matrices whose rows are v x e_k, so that ``points @ matrix`` is v x p; many times faster than numpy's cross."""
     x, y, z = np.moveaxis(vectors, -1, 0)
     result = np.zeros((*vectors.shape, 3))

@@ -13,11 +13,13 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy import ndarray
+from numpy.linalg import solve
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from mereo.geometry.downsampling import farthest_point_order
-from mereo.geometry.transforms import Points, longest_side
+from mereo.geometry.transforms import Points, Subset, longest_side
 
 ANCHORS = 200
 """Surface vertices of each segment that points may follow, spread evenly: the nearest of all lie on one small patch,
@@ -34,10 +36,10 @@ RIDGE = 1e-6
 class PointWeights:
     """Material points that each point follows, and their weights; rows of ``weight`` sum to one."""
 
-    index: Int[np.ndarray, "n k"]
-    weight: Float[np.ndarray, "n k"]
+    index: Int[ndarray, "n k"]
+    weight: Float[ndarray, "n k"]
 
-    def __call__(self, material: Float[np.ndarray, "m *c"]) -> Float[np.ndarray, "n *c"]:
+    def __call__(self, material: Float[ndarray, "m *c"]) -> Float[ndarray, "n *c"]:
         """Values at the points, from values at the material points."""
         flat = material.reshape(len(material), -1)
         rows = np.repeat(np.arange(len(self.index)), self.index.shape[1])
@@ -45,7 +47,7 @@ class PointWeights:
         result = csr_array(entries, shape=(len(self.index), len(flat))) @ flat
         return result.reshape(len(self.index), *material.shape[1:])
 
-    def rows(self, chosen: np.ndarray) -> "PointWeights":
+    def rows(self, chosen: ndarray) -> "PointWeights":
         """Weights of some of the points."""
         return PointWeights(self.index[chosen], self.weight[chosen])
 
@@ -54,8 +56,8 @@ class PointWeights:
 class Anchors:
     """Material points of one segment that others follow, by their index among the object's, and where they are."""
 
-    index: Int[np.ndarray, " a"]
-    position: Float[np.ndarray, "a 3"]
+    index: Int[ndarray, " a"]
+    position: Float[ndarray, "a 3"]
 
     @cached_property
     def tree(self) -> cKDTree:
@@ -75,10 +77,10 @@ class Anchors:
         moment = np.matmul(weighted.transpose(0, 2, 1), basis)
         moment[:, range(1, 4), range(1, 4)] += RIDGE * np.trace(moment, axis1=1, axis2=2)[:, None] / 4
         right = np.tile(np.array([1.0, 0.0, 0.0, 0.0]), (len(points), 1))[..., None]
-        weight = np.matmul(weighted, np.linalg.solve(moment, right))[..., 0]
+        weight = np.matmul(weighted, solve(moment, right))[..., 0]
         return PointWeights(self.index[near], weight / weight.sum(axis=1, keepdims=True))
 
 
-def spread(points: Points, count: int) -> Int[np.ndarray, " m"]:
+def spread(points: Points, count: int) -> Subset:
     """Indices of at most ``count`` points, evenly spread (farthest-point order)."""
     return farthest_point_order(points.astype(np.float32), min(count, len(points)))

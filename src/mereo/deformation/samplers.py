@@ -14,13 +14,14 @@ from functools import cached_property
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Deformations, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
-from mereo.geometry.conventions import Range
+from mereo.geometry.conventions import GridShape, Range, WholeNumbers
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.transforms import AnyPoints, Corners, Points, Vector
 
@@ -45,7 +46,7 @@ class LatticeSampler:
     """Free-form lattices over a box; the control points move by at most ``strength`` of what is injective."""
 
     bounds: Corners
-    cells: tuple[int, int, int]
+    cells: GridShape
     strength: float
 
     def __call__(self, rng: Generator, surface: Surface) -> Deformation:
@@ -206,7 +207,7 @@ class RandomMotion:
     """
 
     rest: SegmentedMesh
-    steps: tuple[tuple[DeformationSampler, tuple[int, ...]], ...]
+    steps: tuple[tuple[DeformationSampler, WholeNumbers], ...]
 
     def __call__(self, rng: Generator) -> Deformations:
         """One deformation for each segment, as ``Scene.sample_deformations`` draws them."""
@@ -214,7 +215,7 @@ class RandomMotion:
         shares = dict[str, float]()
         for number, (sampler, members) in enumerate(self.steps, start=1):
 
-            def surface(members: tuple[int, ...] = members) -> tuple[np.ndarray, np.ndarray]:
+            def surface(members: WholeNumbers = members) -> tuple[ndarray, ndarray]:
                 return _surface(self.rest, chains, members)
 
             if isinstance(sampler, JointSampler) and sampler.name:
@@ -231,7 +232,7 @@ class RandomMotion:
         return _shared(chains)
 
     @cached_property
-    def joints(self) -> dict[str, tuple[JointSampler, tuple[int, ...]]]:
+    def joints(self) -> dict[str, tuple[JointSampler, WholeNumbers]]:
         """Joints with a name, by it, and indices of the segments that each moves; in the order of the steps."""
         joints = ((sampler, members) for sampler, members in self.steps if isinstance(sampler, JointSampler))
         return {sampler.name: (sampler, members) for sampler, members in joints if sampler.name}
@@ -253,7 +254,7 @@ class RandomMotion:
                 chains[index] = (*chains[index], motion)
         return _shared(chains)
 
-    def title(self, number: int, sampler: DeformationSampler, members: tuple[int, ...]) -> str:
+    def title(self, number: int, sampler: DeformationSampler, members: WholeNumbers) -> str:
         """Step ``number``, counted from 1, as people know it from their file, for example "2 joint of hand, arm"."""
         if isinstance(sampler, JointSampler) and sampler.name:
             return sampler.name
@@ -264,7 +265,7 @@ class RandomMotion:
 
 def _shared(chains: Sequence[Deformations]) -> tuple[Compose, ...]:
     """Chains as maps, one for all segments of the same chain."""
-    maps: dict[tuple[int, ...], Compose] = {}
+    maps = dict[WholeNumbers, Compose]()
     return tuple(maps.setdefault(tuple(id(part) for part in chain), Compose(chain)) for chain in chains)
 
 
@@ -289,14 +290,14 @@ def distance_from_line(points: Points, origin: Vector, axis: Vector) -> float:
     return float(norm(across, axis=1).max())
 
 
-def default_cells(bounds: Corners) -> tuple[int, int, int]:
+def default_cells(bounds: Corners) -> GridShape:
     """Cells of a lattice over a box: roughly cubes, two along the shortest side and at most six along the longest."""
     sides = bounds[1] - bounds[0]
     x, y, z = np.clip(np.rint(2 * sides / sides.min()), 2, 6).astype(int)
     return int(x), int(y), int(z)
 
 
-def cubic_cells(bounds: Corners, spacing: float) -> tuple[Corners, tuple[int, int, int]]:
+def cubic_cells(bounds: Corners, spacing: float) -> tuple[Corners, GridShape]:
     """Box around a box, with its middle, that whole cubes fill, and how many of them go along each side."""
     x, y, z = np.maximum(np.ceil((bounds[1] - bounds[0]) / spacing - 1e-6), 1).astype(int)
     half = np.array([x, y, z]) * spacing / 2

@@ -15,6 +15,7 @@ from typing import Any
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from numpy.linalg import det, inv
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial.distance import cdist
@@ -26,10 +27,10 @@ from mereo.geometry.read_only import read_only, read_only_view
 from mereo.geometry.solids import search_tree
 from mereo.geometry.transforms import Matrices, Points, longest_side
 
-Places = Float[np.ndarray, "p 3"]
+Places = Float[ndarray, "p 3"]
 """Positions or vectors in rows: as many as whatever else has the axis ``p``."""
 
-Gradients = Float[np.ndarray, "m 3 3"]
+Gradients = Float[ndarray, "m 3 3"]
 """A matrix for each tetrahedron."""
 
 
@@ -50,8 +51,8 @@ class Tetrahedra:
                 f"a tetrahedron refers to node {int(elements.max() if elements.min() >= 0 else elements.min())}, but "
                 f"there are {len(nodes)}; indices run from 0: subtract 1 where they were counted from 1"
             )
-        self.nodes = read_only_view(np.ascontiguousarray(nodes, dtype=np.float64))
-        self.elements = read_only_view(np.ascontiguousarray(elements, dtype=np.int64))
+        self.nodes = read_only_view(np.ascontiguousarray(nodes, float))
+        self.elements = read_only_view(np.ascontiguousarray(elements, np.int64))
         edges = _edges(self.nodes, self.elements)
         self.volumes = det(edges) / 6
         size = longest_side(self.nodes)
@@ -88,11 +89,11 @@ class Tetrahedra:
         return coo_array((weight / total[rows], (rows, columns)), (len(self.nodes), len(self.elements))).tocsr()
 
     @property
-    def shape_gradients(self) -> Float[np.ndarray, "m 4 3"]:
+    def shape_gradients(self) -> Float[ndarray, "m 4 3"]:
         """Gradients of the linear functions that are 1 at a tetrahedron's corner and 0 at its others."""
         return np.concatenate([-self._rest_inverse.sum(axis=1, keepdims=True), self._rest_inverse], axis=1)
 
-    def volume_ratios(self, nodes: Points) -> Float[np.ndarray, " m"]:
+    def volume_ratios(self, nodes: Points) -> Float[ndarray, " m"]:
         """Volume of each tetrahedron at other node positions, of that at rest; 0 or less where it is inverted."""
         return det(_edges(nodes, self.elements)) / (6 * self.volumes)
 
@@ -104,7 +105,7 @@ class Tetrahedra:
         """Gradients averaged at nodes, which makes them continuous over the surface."""
         return np.reshape(self._node_mean @ gradients.reshape(-1, 9), (-1, 3, 3))
 
-    def locate(self, points: Places) -> Int[np.ndarray, " p"]:
+    def locate(self, points: Places) -> Int[ndarray, " p"]:
         """Tetrahedron around each point at rest, -1 outside."""
         return _locate(self._tree, self.nodes, self.elements, points)
 
@@ -122,7 +123,7 @@ class Tetrahedra:
         entries = np.concatenate([weights.ravel(), outer.ravel()])
         return coo_array((entries, (place, nodes)), (len(points), len(self.nodes))).tocsr()
 
-    def closest(self, points: Places) -> tuple[Int[np.ndarray, "p 3"], Places, Places]:
+    def closest(self, points: Places) -> tuple[Int[ndarray, "p 3"], Places, Places]:
         """Corners, barycentric weights and place of the closest point of the surface at rest."""
         _, face, place = self._surface_tree.squared_distance(self.nodes, self.surface, np.ascontiguousarray(points))
         corners = self.surface[face]
@@ -152,7 +153,7 @@ class TetrahedralMap:
     def __call__(self, points: Places) -> Places:
         """Images of points: affine in each tetrahedron, and continued outside of them."""
         element = self.rest.locate(points)
-        moved = np.empty_like(points, dtype=np.float64)
+        moved = np.empty_like(points, float)
         inside = element >= 0
         first = self.rest.elements[element[inside], 0]
         offset = points[inside] - self.rest.nodes[first]
@@ -167,7 +168,7 @@ class TetrahedralMap:
         gradient = np.einsum("pk,pkij->pij", weights, self._node_gradients[corners])
         return base + _apply(gradient, points - place)
 
-    def rest_points(self, points: Places, guess: Places) -> tuple[Places, Bool[np.ndarray, " p"]]:
+    def rest_points(self, points: Places, guess: Places) -> tuple[Places, Bool[ndarray, " p"]]:
         """Rest points of deformed ones: exact in a tetrahedron, by Newton's method outside.
 
         Where the deformed mesh overlaps itself one of the answers is given.
@@ -175,7 +176,7 @@ class TetrahedralMap:
         elements = self.rest.elements
         element = _locate(search_tree(self.nodes, elements), self.nodes, elements, points)
         inside = element >= 0
-        rest, converged = np.empty_like(points, dtype=np.float64), inside.copy()
+        rest, converged = np.empty_like(points, float), inside.copy()
         first = elements[element[inside], 0]
         back = inv(self._gradients[element[inside]])
         rest[inside] = self.rest.nodes[first] + _apply(back, points[inside] - self.nodes[first])
@@ -195,14 +196,14 @@ def _locate(
     nodes: Points,
     elements: Elements,
     points: Places,
-) -> Int[np.ndarray, " p"]:
+) -> Int[ndarray, " p"]:
     if len(points) == 0:  # libigl's loop expects some
-        return np.empty(0, dtype=np.int64)
-    element = igl.in_element(nodes, elements, np.ascontiguousarray(points, dtype=np.float64), tree)
+        return np.empty(0, np.int64)
+    element = igl.in_element(nodes, elements, np.ascontiguousarray(points, float), tree)
     return element.astype(np.int64)  # C's long long, which numpy tells apart
 
 
-def _apply(matrix: Float[np.ndarray, "p 3 3"], vector: Places) -> Places:
+def _apply(matrix: Float[ndarray, "p 3 3"], vector: Places) -> Places:
     return np.einsum("pij,pj->pi", matrix, vector)
 
 
@@ -227,8 +228,8 @@ class Surface:
     """Closed surface at rest with its search tree and the spline's system, which all of its states share."""
 
     def __init__(self, vertices: Vertices, faces: Faces) -> None:
-        self.vertices = read_only_view(np.ascontiguousarray(vertices, dtype=np.float64))
-        self.faces = read_only_view(np.ascontiguousarray(faces, dtype=np.int64))
+        self.vertices = read_only_view(np.ascontiguousarray(vertices, float))
+        self.faces = read_only_view(np.ascontiguousarray(faces, np.int64))
         self.center = vertices.mean(axis=0)
         self.controls = farthest_point_order(self.vertices, CONTROLS)
         knots = self.vertices[self.controls]
@@ -243,7 +244,7 @@ class Surface:
         return search_tree(self.vertices, self.faces)
 
     @cached_property
-    def solver(self) -> Float[np.ndarray, "k c"]:
+    def solver(self) -> Float[ndarray, "k c"]:
         """Matrix from values at the controls to the spline's coefficients: of r at each control, and of 1, x, y, z."""
         count = len(self.controls)
         basis = self.basis(self.vertices[self.controls])
@@ -253,11 +254,11 @@ class Surface:
         return inv(system)[:, :count]
 
     @cached_property
-    def vertex_basis(self) -> Float[np.ndarray, "v k"]:
+    def vertex_basis(self) -> Float[ndarray, "v k"]:
         """Basis of the spline at all vertices at rest."""
         return read_only(self.basis(self.vertices))
 
-    def basis(self, points: Places) -> Float[np.ndarray, "p k"]:
+    def basis(self, points: Places) -> Float[ndarray, "p k"]:
         """Values of the spline's functions at points at rest."""
         local = points - self.center
         radial = cdist(points, self.vertices[self.controls])
@@ -266,7 +267,7 @@ class Surface:
     def carry(self, values: Vertices, points: Places) -> Places:
         """Values at vertices taken from the closest surface point, fading with its distance."""
         squared, face, place = self._tree.squared_distance(
-            self.vertices, self.faces, np.ascontiguousarray(points, dtype=np.float64)
+            self.vertices, self.faces, np.ascontiguousarray(points, float)
         )
         corners = self.faces[face]
         weights = barycentric(self.vertices[corners], place)
@@ -282,7 +283,7 @@ class SurfaceMap:
     vertices: Vertices
 
     @cached_property
-    def _coefficients(self) -> Float[np.ndarray, "k 3"]:
+    def _coefficients(self) -> Float[ndarray, "k 3"]:
         return self.rest.solver @ self.vertices[self.rest.controls]
 
     @cached_property

@@ -6,9 +6,11 @@ SIGGRAPH 1984. Lengths share one unit, angles are in radians; notation as in ``m
 """
 
 from dataclasses import dataclass
+from math import pi
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 from scipy.interpolate import CubicSpline
@@ -16,7 +18,7 @@ from scipy.ndimage import map_coordinates
 
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import crossing, smooth_step, turn, unit
-from mereo.geometry.conventions import Range
+from mereo.geometry.conventions import GridShape, Range
 from mereo.geometry.transforms import Corners, Points, Vector, unit_rows
 
 LATTICE_LIMIT = 1 / 2.48
@@ -55,7 +57,7 @@ class Bend:
         s = np.clip(along, 0.0, self.length)
         angle = s * (self.angle_rad / self.length)
         # of the arc: (sin a / k, (1 - cos a) / k), written so that it holds for curvature zero
-        half = np.sinc(angle / (2 * np.pi))
+        half = np.sinc(angle / (2 * pi))
         x, y = s * half * np.cos(angle / 2), s * half * np.sin(angle / 2)
         cosine, sine, beyond = np.cos(angle), np.sin(angle), along - s
         new_along = x + beyond * cosine - offset * sine
@@ -134,9 +136,9 @@ class SmoothField:
     Amplitudes a are lengths, frequencies b radians per length, phases c radians.
     """
 
-    amplitudes: Float[np.ndarray, "k 3"]
-    frequencies: Float[np.ndarray, "k 3"]
-    phases: Float[np.ndarray, " k"]
+    amplitudes: Float[ndarray, "k 3"]
+    frequencies: Float[ndarray, "k 3"]
+    phases: Float[ndarray, " k"]
 
     def __post_init__(self) -> None:
         if not self.gradient_bound < 1:
@@ -155,9 +157,9 @@ class SmoothField:
     def sample(cls, rng: Generator, strength: float, wavelength: Range, modes: int = 4) -> "SmoothField":
         """Field of ``modes`` random waves, wavelengths uniform in a range, with gradient bound ``strength``."""
         directions, amplitudes = named(rng, "pattern").normal(size=(2, modes, 3))
-        frequencies = unit_rows(directions) * 2 * np.pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
+        frequencies = unit_rows(directions) * 2 * pi / named(rng, "wavelength").uniform(*wavelength, size=(modes, 1))
         shares = norm(amplitudes, axis=1) @ norm(frequencies, axis=1)
-        phases = named(rng, "phase", "rad").uniform(0, 2 * np.pi, size=modes)
+        phases = named(rng, "phase", "rad").uniform(0, 2 * pi, size=modes)
         return cls(amplitudes * (strength / shares), frequencies, phases)
 
     def __call__(self, points: Points) -> Points:
@@ -177,7 +179,7 @@ class FreeFormLattice:
 
     origin: Vector
     spacing: Vector
-    displacements: Float[np.ndarray, "a b c 3"]
+    displacements: Float[ndarray, "a b c 3"]
 
     def __post_init__(self) -> None:
         share = float(np.abs(self.displacements / self.spacing).max())
@@ -188,7 +190,7 @@ class FreeFormLattice:
             )
 
     @classmethod
-    def sample(cls, rng: Generator, bounds: Corners, cells: tuple[int, int, int], strength: float) -> "FreeFormLattice":
+    def sample(cls, rng: Generator, bounds: Corners, cells: GridShape, strength: float) -> "FreeFormLattice":
         """Random control points over a box of ``cells`` and one spacing around; ``strength`` in [0, 1) of the limit."""
         spacing = (bounds[1] - bounds[0]) / np.array(cells)
         shape = (cells[0] + 3, cells[1] + 3, cells[2] + 3, 3)
@@ -222,8 +224,8 @@ class CurveSweep:
     @classmethod
     def through(
         cls,
-        nodes: Float[np.ndarray, " m"],
-        centers: Float[np.ndarray, "m 3"],
+        nodes: Float[ndarray, " m"],
+        centers: Float[ndarray, "m 3"],
         normal: Vector,
         radius: float,
     ) -> "CurveSweep":
@@ -253,7 +255,7 @@ class CurveSweep:
         return moved
 
 
-def transport_frames(tangents: Float[np.ndarray, "m 3"], normal: Vector) -> Float[np.ndarray, "m 3 3"]:
+def transport_frames(tangents: Float[ndarray, "m 3"], normal: Vector) -> Float[ndarray, "m 3 3"]:
     """Frames along a curve, rows tangent, normal, binormal, by parallel transport.
 
     From one tangent to the next the frame turns by the smallest rotation, so it never twists about the curve (Bergou

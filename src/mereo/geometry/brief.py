@@ -11,10 +11,10 @@ FEW = 6
 """Names that are listed before the others are only counted."""
 
 
-def listed(names: Iterable[str], most: int = FEW) -> str:
-    """Names with commas; of more than ``most`` the first ones, and how many there are."""
+def listed(names: Iterable[str]) -> str:
+    """Names with commas; of more than ``FEW`` the first ones, and how many there are."""
     every = list(names)
-    return ", ".join(every) if len(every) <= most else f"{', '.join(every[: most - 1])}, ... ({len(every)})"
+    return ", ".join(every) if len(every) <= FEW else f"{', '.join(every[: FEW - 1])}, ... ({len(every)})"
 
 
 def counted(count: int, what: str) -> str:

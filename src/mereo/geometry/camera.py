@@ -5,19 +5,39 @@ pixel (column u, row v) is at (u + 0.5, v + 0.5). ``unproject`` and ``project`` 
 """
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple
+from math import inf
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy import ndarray
+from numpy.linalg import norm
 from numpy.typing import ArrayLike
 
 from mereo.geometry.brief import counted, sides
 from mereo.geometry.conventions import CloudAxes, check_real
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Normalizer, Points, Transform, rigid, transform_points, unit_rows
+from mereo.geometry.transforms import (
+    AnyPoints,
+    Flags,
+    Normalizer,
+    Points,
+    Rows,
+    Transform,
+    Values,
+    rigid,
+    transform_points,
+    unit_rows,
+)
 
 Size = tuple[int, int]
 """Width and height of an image in pixels."""
+
+PixelValues = Float[ndarray, "h w"]
+"""A number for each pixel."""
+
+PixelMask = Bool[ndarray, "h w"]
+"""Whether each pixel is meant."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +60,13 @@ class Camera:
     center_y_px: float
 
     def __post_init__(self) -> None:
-        size: tuple[Any, ...] = self.width, self.height
+        size = self.width, self.height
         if not all(isinstance(side, int | np.integer) and not isinstance(side, bool) and side > 0 for side in size):
             raise ValueError(
                 f"image size is {self.width} x {self.height}; both must be positive whole numbers: check the intrinsics"
             )
         check_real(np.array([self.focal_x_px, self.focal_y_px, self.center_x_px, self.center_y_px]), "the camera")
-        if not (0 < self.focal_x_px < np.inf and 0 < self.focal_y_px < np.inf):
+        if not (0 < self.focal_x_px < inf and 0 < self.focal_y_px < inf):
             raise ValueError(
                 f"focal length is {self.focal_x_px} x {self.focal_y_px} pixels; both must be positive: "
                 "check the intrinsics file"
@@ -74,23 +94,23 @@ class Camera:
                 f"the camera matrix is {matrix.tolist()}; it must be 3 x 3 numbers with 0 0 1 in the last row: give K "
                 "as OpenCV and ROS have it, row by row"
             )
-        (focal_x, _, center_x), (_, focal_y, center_y), _ = matrix.reshape(3, 3).astype(np.float64).tolist()
+        (focal_x, _, center_x), (_, focal_y, center_y), _ = matrix.reshape(3, 3).astype(float).tolist()
         return cls(width, height, focal_x, focal_y, center_x + 0.5, center_y + 0.5)
 
-    def directions(self) -> Float[np.ndarray, "h w 3"]:
+    def directions(self) -> Float[ndarray, "h w 3"]:
         """Rays through the pixel centres, scaled to z = 1, so that depth times direction is the point."""
         x = (np.arange(self.width) + 0.5 - self.center_x_px) / self.focal_x_px
         y = (np.arange(self.height) + 0.5 - self.center_y_px) / self.focal_y_px
         grid_y, grid_x = np.meshgrid(y, x, indexing="ij")
         return np.stack([grid_x, grid_y, np.ones_like(grid_x)], axis=-1)
 
-    def project(self, points: Points) -> Float[np.ndarray, "n 2"]:
+    def project(self, points: Points) -> Float[ndarray, "n 2"]:
         """Pixel coordinates (u, v) of points in the camera frame, z > 0."""
         u = self.focal_x_px * points[:, 0] / points[:, 2] + self.center_x_px
         v = self.focal_y_px * points[:, 1] / points[:, 2] + self.center_y_px
         return np.stack([u, v], axis=-1)
 
-    def unproject(self, pixels: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"]) -> Points:
+    def unproject(self, pixels: Float[ndarray, "n 2"], depth: Values) -> Points:
         """Points in the camera frame from pixel coordinates and depth (z)."""
         x = (pixels[:, 0] - self.center_x_px) / self.focal_x_px * depth
         y = (pixels[:, 1] - self.center_y_px) / self.focal_y_px * depth
@@ -108,10 +128,10 @@ class PointCloud:
     """
 
     points: Points
-    normals: Float[np.ndarray, "_ 3"] | None = None
+    normals: AnyPoints | None = None
 
     @classmethod
-    def of(cls, rows: Float[np.ndarray, "n c"]) -> "PointCloud":
+    def of(cls, rows: Rows) -> "PointCloud":
         """Cloud of rows with three numbers, or with six where a normal of any length follows each position."""
         if rows.shape[1] == 3:
             return cls(rows)
@@ -133,7 +153,7 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    def rows(self, keep: Bool[np.ndarray, " n"]) -> "PointCloud":
+    def rows(self, keep: Flags) -> "PointCloud":
         """Some of the points; the cloud itself where these are all."""
         if keep.all():
             return self
@@ -157,7 +177,7 @@ class DepthImage:
         camera: the intrinsics it was taken with.
     """
 
-    depth: Float[np.ndarray, "h w"]
+    depth: PixelValues
     camera: Camera
 
     def __post_init__(self) -> None:
@@ -181,15 +201,15 @@ class DepthImage:
         return f"DepthImage({self.camera.width} x {self.camera.height} pixels, {len(measured):,} measured{depths})"
 
     @property
-    def valid(self) -> Bool[np.ndarray, "h w"]:
+    def valid(self) -> PixelMask:
         """Pixels with a measurement."""
         return self.depth > 0
 
     def from_ray_lengths(self) -> "DepthImage":
         """Image of depths along z, of this one whose values are distances from the camera along each pixel's ray."""
-        return DepthImage(self.depth / np.linalg.norm(self.camera.directions(), axis=-1), self.camera)
+        return DepthImage(self.depth / norm(self.camera.directions(), axis=-1), self.camera)
 
-    def to_points(self, mask: Bool[np.ndarray, "h w"] | None = None) -> PointCloud:
+    def to_points(self, mask: PixelMask | None = None) -> PointCloud:
         """Point cloud of every measured pixel (inside ``mask`` when given), row by row.
 
         Raises ``ValueError`` for a mask of another size, or of anything but truth values.
@@ -201,7 +221,7 @@ class DepthImage:
             )
         keep = self.valid if mask is None else self.valid & mask
         points = self.camera.directions()[keep] * self.depth[keep][:, None]
-        return PointCloud(points.astype(np.float64))
+        return PointCloud(points.astype(float))
 
 
 # --- lines of sight ---------------------------------------------------------------------------------------------------
@@ -223,7 +243,7 @@ class SharedNoise(NamedTuple):
         pixel: angle between neighbouring pixels of the camera.
     """
 
-    std: float = np.inf
+    std: float = inf
     side: float = 0.0
     pixel: float = 0.0
 
@@ -244,8 +264,8 @@ class SightLines:
         shared_noise: of the camera.
     """
 
-    past: Float[np.ndarray, "p 3"]
-    unknown: Float[np.ndarray, "u 3"]
+    past: Float[ndarray, "p 3"]
+    unknown: Float[ndarray, "u 3"]
     other_lines: SightKind | None = None
     shared_noise: SharedNoise = NOT_KNOWN
 

@@ -20,6 +20,30 @@ Range = tuple[float, float]
 """Least and greatest value."""
 
 
+Pair = tuple[int, int]
+"""Two whole numbers that belong together: two indices, two counts, a column and a row."""
+
+
+WholeNumbers = tuple[int, ...]
+"""Whole numbers in an order, such as the lengths of an array's axes."""
+
+
+GridShape = tuple[int, int, int]
+"""Numbers of cells or nodes along x, y and z."""
+
+
+Triple = tuple[float, float, float]
+"""Numbers along x, y and z, as settings have them."""
+
+
+Facts = Mapping[str, Any]
+"""Values by their names, any of which may be missing."""
+
+
+Texts = dict[str, str]
+"""Texts by their names."""
+
+
 CloudAxes = Literal["camera", "scanner"]
 """Axes of a point cloud: camera is x right, y down, z forward; scanner is y up, z toward the scanner."""
 

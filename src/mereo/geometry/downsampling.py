@@ -1,10 +1,15 @@
 """Fewer points of a cloud: at random, evenly in space, or means of neighbours."""
 
+from math import inf
+
 import numpy as np
-from jaxtyping import Float, Int, Real, Shaped
+from jaxtyping import Float, Real, Shaped
+from numpy import ndarray
+from numpy.linalg import norm, svd
+from numpy.random import default_rng
 from scipy.spatial import cKDTree
 
-from mereo.geometry.transforms import Indices, Points, Values, longest_side
+from mereo.geometry.transforms import Indices, Points, Subset, Values, longest_side
 
 MAX_POINTS = 50_000
 """Many times what any network is trained on; comparing neighbours takes a fraction of a second."""
@@ -13,14 +18,14 @@ STEEPEST = 4.0
 """Gap in range, in widths of a cell there, from which on there are two surfaces: one would be seen at 76 degrees."""
 
 
-def random_subset(rows: Shaped[np.ndarray, "n *r"], limit: int) -> Shaped[np.ndarray, "m *r"]:
+def random_subset(rows: Shaped[ndarray, "n *r"], limit: int) -> Shaped[ndarray, "m *r"]:
     """At most ``limit`` of the rows, drawn at random but always the same; all, in their order, where they are few."""
     if len(rows) <= limit:
         return rows
-    return rows[np.random.default_rng(0).choice(len(rows), limit, replace=False)]
+    return rows[default_rng(0).choice(len(rows), limit, replace=False)]
 
 
-def thin_to_grid(points: Points, limit: int) -> Int[np.ndarray, " m"]:
+def thin_to_grid(points: Points, limit: int) -> Subset:
     """Rows of at most ``limit`` of the points, one per cell of a cubic grid, in their order; all where they are few.
 
     Single measurements are kept, not means of cells: a mean of both sides of an edge would lie on neither. The first
@@ -46,7 +51,7 @@ def thin_to_grid(points: Points, limit: int) -> Int[np.ndarray, " m"]:
         cell, rows = finer, more
 
 
-def means_along_sight(points: Points, limit: int) -> Float[np.ndarray, "m 3"]:
+def means_along_sight(points: Points, limit: int) -> Float[ndarray, "m 3"]:
     """At most ``limit`` points, each the mean of neighbours on one surface; the cloud itself where it has no more.
 
     Neighbours are seen from the origin within one cell of a grid of lines of sight, the smallest cells that suffice; a
@@ -56,11 +61,11 @@ def means_along_sight(points: Points, limit: int) -> Float[np.ndarray, "m 3"]:
     if len(points) <= limit:
         return points
     points = random_subset(points, max(limit, MAX_POINTS))
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     sight = points / distance[:, None]
     ahead = sight.mean(axis=0)
-    across = np.linalg.svd(ahead[None])[2][1:]
-    flat = sight @ across.T * (np.linalg.norm(ahead) / (sight @ ahead))[:, None]
+    across = svd(ahead[None])[2][1:]
+    flat = sight @ across.T * (norm(ahead) / (sight @ ahead))[:, None]
     flat -= flat.min(axis=0)
     # an extent, as a slope, of a tenth of a millimetre in a hundred metres counts as none
     cell = max(float(np.ptp(flat, axis=0).max()), 1e-6) / np.sqrt(limit)
@@ -70,20 +75,20 @@ def means_along_sight(points: Points, limit: int) -> Float[np.ndarray, "m 3"]:
     return total / np.bincount(group)[:, None]
 
 
-def _surfaces_in_cells(flat: Float[np.ndarray, "n 2"], distance: Values, cell: float) -> Indices:
+def _surfaces_in_cells(flat: Float[ndarray, "n 2"], distance: Values, cell: float) -> Indices:
     """Number of the group of each point: those of one cell without a gap in distance."""
     index = np.floor(flat / cell).astype(np.int64)
     key = index[:, 0] * (index[:, 1].max() + 1) + index[:, 1]
     order = np.lexsort((distance, key))
-    starts = np.ones(len(flat), dtype=bool)
+    starts = np.ones(len(flat), bool)
     gap = np.diff(distance[order]) > STEEPEST * cell * distance[order][:-1]
     starts[1:] = (np.diff(key[order]) != 0) | gap
-    group = np.empty(len(flat), dtype=np.int64)
+    group = np.empty(len(flat), np.int64)
     group[order] = np.cumsum(starts) - 1
     return group
 
 
-def first_in_cell(offsets: Points, cell: float) -> Int[np.ndarray, " m"]:
+def first_in_cell(offsets: Points, cell: float) -> Subset:
     """Rows of the first point in each occupied cell of a grid, in their order; ``offsets`` are not negative."""
     index = np.floor(offsets / cell).astype(np.int64)
     counts = index.max(axis=0) + 1
@@ -95,7 +100,7 @@ def spacing(points: Points) -> float:
     """Median distance from a point to its nearest neighbour at another place; 0 where all coincide."""
     sample = points[:: max(1, len(points) // 1000)]  # whose median is good to a few percent
     distance = cKDTree(points).query(sample, k=min(8, len(points)))[0].reshape(len(sample), -1)
-    apart = np.where(distance > 0, distance, np.inf).min(axis=1)
+    apart = np.where(distance > 0, distance, inf).min(axis=1)
     return float(np.median(apart[np.isfinite(apart)])) if np.isfinite(apart).any() else 0.0
 
 
@@ -106,7 +111,7 @@ def spacing(points: Points) -> float:
 # training.
 
 
-def farthest_point_order(points: Real[np.ndarray, "n 3"], count: int) -> Int[np.ndarray, " m"]:
+def farthest_point_order(points: Real[ndarray, "n 3"], count: int) -> Subset:
     """Rows of ``points`` such that each next point is the farthest from all before it; ``m = min(n, count)`` of them.
 
     Deterministic: distances are computed in single precision with one fixed order of operations. Ties go to the point
@@ -117,16 +122,16 @@ def farthest_point_order(points: Real[np.ndarray, "n 3"], count: int) -> Int[np.
     """
     m = min(count, len(points))
     if m <= 0:
-        return np.empty(0, dtype=np.int64)
+        return np.empty(0, np.int64)
     rank = np.lexsort(points.T[::-1])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     # about the middle, so that single precision is spent on the shape and not on where it is
-    xyz = np.ascontiguousarray((points[rank] - middle).T, dtype=np.float32)
+    xyz = np.ascontiguousarray((points[rank] - middle).T, np.float32)
     current = int(np.add.reduce(xyz * xyz, axis=0).argmax())
     # buffers are reused and every operation is one pass, because m passes over n points dominate
-    order = np.empty(m, dtype=np.int64)
+    order = np.empty(m, np.int64)
     difference, square = np.empty_like(xyz), np.empty_like(xyz[0])
-    distance = np.full(xyz.shape[1], np.inf, dtype=np.float32)
+    distance = np.full(xyz.shape[1], inf, np.float32)
     for i in range(m):
         order[i] = current
         np.subtract(xyz, xyz[:, current : current + 1], out=difference)

@@ -4,13 +4,21 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
 
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.mesh import Color
+from mereo.geometry.conventions import Names
+from mereo.geometry.mesh import SegmentColors
 from mereo.geometry.transforms import Labels, PointArray, Points, Values, Vector
 
+GridLabels = UInt8[ndarray, "x y z"]
+"""Label of each node of a grid."""
 
-def part_of_grid(low: Int[np.ndarray, "3"], end: Int[np.ndarray, "3"]) -> tuple[slice, ...]:
+VoxelMask = Bool[ndarray, "x y z"]
+"""Whether each voxel of a grid is meant."""
+
+
+def part_of_grid(low: Int[ndarray, "3"], end: Int[ndarray, "3"]) -> tuple[slice, ...]:
     """Index of the voxels from ``low`` to before ``end``."""
     return tuple(slice(first, after) for first, after in zip(low, end, strict=True))
 
@@ -26,28 +34,28 @@ class LabelGrid:
         names: of the segments.
     """
 
-    labels: UInt8[np.ndarray, "x y z"]
+    labels: GridLabels
     origin: Vector
     spacing: Vector
-    names: tuple[str, ...]
+    names: Names
 
     def __repr__(self) -> str:
         voxels = " x ".join(map(str, self.labels.shape))
         return f"LabelGrid({voxels} voxels, {self.spacing.max():.3g} apart; {listed(self.names)})"
 
-    def axes(self) -> tuple[Float[np.ndarray, " x"], Float[np.ndarray, " y"], Float[np.ndarray, " z"]]:
+    def axes(self) -> tuple[Float[ndarray, " x"], Float[ndarray, " y"], Float[ndarray, " z"]]:
         """Coordinates of the voxel centres along each axis."""
         x, y, z = (self.origin[i] + np.arange(self.labels.shape[i]) * self.spacing[i] for i in range(3))
         return x, y, z
 
-    def positions(self, index: Int[np.ndarray, "*n 3"]) -> PointArray:
+    def positions(self, index: Int[ndarray, "*n 3"]) -> PointArray:
         """Centres of voxels given by their index."""
         return self.origin + index * self.spacing
 
-    def touched_sides(self) -> Bool[np.ndarray, "2 3"]:
+    def touched_sides(self) -> Bool[ndarray, "2 3"]:
         """Whether a segment reaches the grid's lower and upper border along x, y, z."""
         ends = [[np.take(self.labels, end, axis=axis).any() for axis in range(3)] for end in (0, -1)]
-        return np.array(ends, dtype=bool)
+        return np.array(ends, bool)
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,8 +77,8 @@ class SegmentedCloud:
     labels: Labels
     confidence: Values
     occupancy: Values
-    names: tuple[str, ...]
-    colors: tuple[Color, ...]
+    names: Names
+    colors: SegmentColors
 
     def __post_init__(self) -> None:
         count, *others = map(len, (self.points, self.labels, self.confidence, self.occupancy))

@@ -5,13 +5,16 @@ from functools import cache
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
+from mereo.geometry.conventions import WholeNumbers
+from mereo.geometry.labels import VoxelMask
 from mereo.geometry.mesh import AnyFaces
 from mereo.geometry.transforms import Flags, Points
 
-CellFlags = Bool[np.ndarray, "i j k"]
+CellFlags = Bool[ndarray, "i j k"]
 """Whether each cell between nodes is meant."""
 
 CORNERS = np.array([[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 1], [0, 1, 1], [1, 1, 1], [1, 0, 1]])
@@ -22,7 +25,7 @@ FAR_SIDES = ((2, 3, 7, 6), (1, 2, 6, 5), (4, 5, 6, 7))
 
 
 @cache
-def cases() -> Int[np.ndarray, "256 f 3 3"]:
+def cases() -> Int[ndarray, "256 f 3 3"]:
     """Corners of the faces in a cell, in half cells, or -1 where there are fewer than five, by libigl.
 
     Bit k of a case says whether the field is positive at corner k.
@@ -30,12 +33,12 @@ def cases() -> Int[np.ndarray, "256 f 3 3"]:
     faces = np.full((256, 5, 3, 3), -1)
     for case in range(1, 255):
         values = np.where(case >> np.arange(8) & 1, 1.0, -1.0)
-        middles, rows, _ = igl.marching_cubes(values, CORNERS.astype(np.float64), np.arange(8)[None], 0.0)
+        middles, rows, _ = igl.marching_cubes(values, CORNERS.astype(float), np.arange(8)[None], 0.0)
         faces[case, : len(rows)] = 2 * middles[rows]
     return faces
 
 
-def over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
+def over_corners(values: ndarray, combine: np.ufunc) -> ndarray:
     """Values of each cell's eight corners, joined by ``combine``."""
     for axis in range(3):
         count = values.shape[axis]
@@ -45,26 +48,26 @@ def over_corners(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
     return values
 
 
-def changing_cells(values: np.ndarray) -> CellFlags:
+def changing_cells(values: ndarray) -> CellFlags:
     """Cells whose eight corners do not all have one value."""
     return over_corners(values, np.maximum) != over_corners(values, np.minimum)
 
 
-def on_both_sides(values: np.ndarray, axis: int, combine: np.ufunc) -> np.ndarray:
+def on_both_sides(values: ndarray, axis: int, combine: np.ufunc) -> ndarray:
     """Values that lie between nodes along an axis, at the nodes: those of both sides joined by ``combine``."""
     before, after = [(0, 0)] * 3, [(0, 0)] * 3
     before[axis], after[axis] = (1, 0), (0, 1)
     return combine(np.pad(values, before), np.pad(values, after))
 
 
-def nodes_of(cells: CellFlags) -> Bool[np.ndarray, "x y z"]:
+def nodes_of(cells: CellFlags) -> VoxelMask:
     """Nodes that are corners of these cells."""
     for axis in range(3):
         cells = on_both_sides(cells, axis, np.logical_or)
     return cells
 
 
-def zero_surface(field: Float[np.ndarray, "x y z"]) -> tuple[Points, AnyFaces]:
+def zero_surface(field: Float[ndarray, "x y z"]) -> tuple[Points, AnyFaces]:
     """Vertices, in steps of the grid, and faces of the surface where a field is 0; they face where it is negative."""
     inside, doubled = field > 0, tuple(2 * size for size in field.shape)
     cells = np.argwhere(changing_cells(inside))
@@ -76,19 +79,19 @@ def zero_surface(field: Float[np.ndarray, "x y z"]) -> tuple[Points, AnyFaces]:
     corners = np.where(turned[cell, None, None], corners[:, ::-1], corners)
     edges, rows = np.unique(np.ravel_multi_index(tuple(np.moveaxis(corners, 2, 0)), doubled), return_inverse=True)
     middle = np.stack(np.unravel_index(edges, doubled), axis=1)
-    low, high = (field[tuple(node.T // 2)].astype(np.float64) for node in (middle, middle + 1))
+    low, high = (field[tuple(node.T // 2)].astype(float) for node in (middle, middle + 1))
     return middle // 2 + middle % 2 * (low / (low - high))[:, None], rows.reshape(-1, 3)
 
 
-def _turned(cells: Int[np.ndarray, "c 3"], positive: Bool[np.ndarray, "c 8"], shape: tuple[int, ...]) -> Flags:
+def _turned(cells: Int[ndarray, "c 3"], positive: Bool[ndarray, "c 8"], shape: WholeNumbers) -> Flags:
     """Whether each cell is taken for its negative, which cuts corners off where this joins them.
 
     Where two cells share a side on which opposite corners are alike, both are; else the surface would be open there.
     So are all cells that hang together in this way, by the sign at the first of them.
     """
-    row_of = np.zeros(shape, dtype=np.int64)
+    row_of = np.zeros(shape, np.int64)
     row_of[tuple(cells.T)] = np.arange(len(cells))
-    links = list[np.ndarray]()
+    links = list[ndarray]()
     for step, side in zip(np.eye(3, dtype=int), FAR_SIDES, strict=True):
         a, b, c, d = positive[:, side].T
         rows = np.flatnonzero((a == c) & (b == d) & (a != b))

@@ -6,40 +6,64 @@ part of the data: they travel through datasets, weights and every export, so a l
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+from numpy.linalg import norm
+from numpy.random import default_rng
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mereo.geometry.brief import counted, listed, sides
+from mereo.geometry.conventions import Names, Pair
 from mereo.geometry.read_only import read_only_view
 from mereo.geometry.transforms import (
     AnyPoints,
     Corners,
     Indices,
+    Matrices,
     Points,
     Transform,
     transform_points,
     unit_rows,
 )
 
-Vertices = Float[np.ndarray, "v 3"]
+Vertices = Float[ndarray, "v 3"]
 """Positions or vectors in rows: one for each vertex of a mesh."""
 
-Faces = Int[np.ndarray, "f 3"]
+Faces = Int[ndarray, "f 3"]
 """Three indices of vertices in each row, counter-clockwise seen from outside."""
 
-AnyFaces = Int[np.ndarray, "_ 3"]
+AnyFaces = Int[ndarray, "_ 3"]
 """The same, as many as there are: of a mesh that is changed, with ``AnyPoints``."""
 
-Elements = Int[np.ndarray, "m 4"]
+EMPTY_MESH = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+"""That of a segment which was not found."""
+
+ChangedMesh = tuple[Float[ndarray, "w 3"], Int[ndarray, "g 3"]]
+"""Vertices and faces of a mesh that comes of another one, in numbers of their own."""
+
+Elements = Int[ndarray, "m 4"]
 """Four indices of nodes in each row, a tetrahedron."""
 
 Color = tuple[int, int, int]
 """Red, green, blue in 0..255."""
 
-PALETTE: tuple[Color, ...] = (
+SegmentColors = tuple[Color, ...]
+"""Colour of each segment, in label order."""
+
+Nested = tuple[tuple[str, str], ...]
+"""Pairs of names of segments, the inner one first."""
+
+AnyMesh = tuple[AnyPoints, AnyFaces]
+"""Vertices and faces."""
+
+Colors = UInt8[ndarray, "n 3"]
+"""A colour for each row of the axis ``n``."""
+
+PALETTE: SegmentColors = (
     (86, 180, 233),
     (230, 159, 0),
     (0, 158, 115),
@@ -87,15 +111,15 @@ class Segment:
     @property
     def bounds(self) -> Corners:
         """Lower and upper corner of the axis-aligned box; infinite, upside down, without vertices."""
-        return np.stack([self.vertices.min(axis=0, initial=np.inf), self.vertices.max(axis=0, initial=-np.inf)])
+        return np.stack([self.vertices.min(axis=0, initial=inf), self.vertices.max(axis=0, initial=-inf)])
 
     @property
     def volume(self) -> float:
         """Signed volume (divergence theorem); negative when the faces are inside out."""
-        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        a, b, c = face_corners(self.vertices, self.faces)
         return float(np.einsum("ij,ij->", a, np.cross(b, c)) / 6.0)
 
-    def edge_imbalance(self) -> tuple[int, int]:
+    def edge_imbalance(self) -> Pair:
         """Numbers of open and of misoriented edges: both zero exactly when the mesh is closed and oriented alike."""
         return edge_imbalance(self.faces)
 
@@ -112,7 +136,7 @@ class SegmentedMesh:
     """
 
     segments: tuple[Segment, ...]
-    nested: tuple[tuple[str, str], ...] = ()
+    nested: Nested = ()
 
     def __post_init__(self) -> None:
         names = [segment.name for segment in self.segments]
@@ -141,12 +165,12 @@ class SegmentedMesh:
         return f"SegmentedMesh({counted(len(self.segments), 'segment')}: {listed(self.names)}; {faces}, {size})"
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Names:
         """Names of the segments, in label order."""
         return tuple(segment.name for segment in self.segments)
 
     @property
-    def colors(self) -> tuple[Color, ...]:
+    def colors(self) -> SegmentColors:
         """Colours of the segments, in label order."""
         return tuple(segment.color for segment in self.segments)
 
@@ -157,7 +181,7 @@ class SegmentedMesh:
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
 
     @property
-    def nesting(self) -> tuple[tuple[int, int], ...]:
+    def nesting(self) -> tuple[Pair, ...]:
         """Pairs (inner, outer) of segments' indices, with what follows: a in b and b in c puts a in c."""
         index = {name: i for i, name in enumerate(self.names)}
         pairs = {(index[inner], index[outer]) for inner, outer in self.nested}
@@ -172,7 +196,7 @@ class SegmentedMesh:
         return tuple(index not in hiding for index in range(len(self.segments)))
 
     @property
-    def owned_volumes(self) -> Float[np.ndarray, " s"]:
+    def owned_volumes(self) -> Float[ndarray, " s"]:
         """Volume that belongs to each segment: its mesh's without that of the segments nested in it."""
         volumes = np.array([segment.volume for segment in self.segments])
         for outer in (i for i, s in enumerate(self.segments) if len(s.faces)):  # the inner ones come first and are done
@@ -188,7 +212,7 @@ class SegmentedMesh:
         """Mesh with all vertices mapped by a homogeneous transform."""
         return self.with_vertices([transform_points(transform, segment.vertices) for segment in self.segments])
 
-    def merged(self) -> tuple[Vertices, Faces, Int[np.ndarray, " f"]]:
+    def merged(self) -> tuple[Vertices, Faces, Int[ndarray, " f"]]:
         """All segments in one array: vertices, faces, and for each face the index of its segment."""
         offsets = np.cumsum([0] + [len(s.vertices) for s in self.segments])
         vertices = np.concatenate([s.vertices for s in self.segments])
@@ -229,14 +253,14 @@ def check_segment(segment: Segment) -> None:
         raise ValueError(f"segment {segment.name!r} has {fault}")
 
 
-def directed_edges(faces: AnyFaces) -> Int[np.ndarray, "_ 2"]:
+def directed_edges(faces: AnyFaces) -> Int[ndarray, "_ 2"]:
     """The three edges of each face in turn, from corner to corner."""
     return faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2).astype(np.int64)
 
 
 def edge_uses(
     faces: Faces,
-) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, " e"], Bool[np.ndarray, " e"]]:
+) -> tuple[Int[ndarray, "e 2"], Int[ndarray, " e"], Bool[ndarray, " e"]]:
     """Edges with their lower end first, how many faces each has, and whether these do not go there and back alike."""
     directed = directed_edges(faces)
     size = int(directed.max(initial=0)) + 1
@@ -246,20 +270,20 @@ def edge_uses(
     return np.stack(np.divmod(keys, size), axis=1), uses, unbalanced
 
 
-def edge_imbalance(faces: Faces) -> tuple[int, int]:
+def edge_imbalance(faces: Faces) -> Pair:
     """Numbers of open and of misoriented edges: both zero exactly when a mesh is closed and oriented alike."""
     _, uses, unbalanced = edge_uses(faces)
     return int((uses % 2 == 1).sum()), int((unbalanced & (uses % 2 == 0)).sum())
 
 
-def three_cornered(faces: Faces) -> Bool[np.ndarray, " f"]:
+def three_cornered(faces: Faces) -> Bool[ndarray, " f"]:
     """Which faces have three different vertices."""
-    return np.asarray((faces != np.roll(faces, 1, axis=1)).all(axis=1))
+    return (faces != np.roll(faces, 1, axis=1)).all(axis=1)
 
 
 def with_used_vertices(
-    vertices: Vertices, faces: Int[np.ndarray, "f k"]
-) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "f k"]]:
+    vertices: Vertices, faces: Int[ndarray, "f k"]
+) -> tuple[Float[ndarray, "w 3"], Int[ndarray, "f k"]]:
     """Mesh without the vertices that no face has; the others stay in their order."""
     used, kept = np.unique(faces, return_inverse=True)  # flat before numpy 2
     return vertices[used], kept.reshape(faces.shape)
@@ -270,13 +294,18 @@ def palette_color(index: int) -> Color:
     return PALETTE[index % len(PALETTE)]
 
 
-def area_vectors(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "f 3"]:
+def face_corners(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, ...]:
+    """First, second and third corner of each face."""
+    return tuple(vertices[faces[:, k]] for k in range(3))
+
+
+def area_vectors(vertices: Vertices, faces: Faces) -> Float[ndarray, "f 3"]:
     """Normals of faces, each as long as twice the face's area."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    a, b, c = face_corners(vertices, faces)
     return np.cross(b - a, c - a)
 
 
-def connected(pairs: Int[np.ndarray, "p 2"], count: int) -> Indices:
+def connected(pairs: Int[ndarray, "p 2"], count: int) -> Indices:
     """Number of the group of each of ``count`` things, of which pairs hang together."""
     graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count))
     return connected_components(graph, directed=False)[1].astype(np.int64)
@@ -287,10 +316,10 @@ def surface_points(vertices: Vertices, faces: Faces, count: int) -> tuple[Points
 
     Vertices are not: a CAD program's are where a surface is round, none where it is flat.
     """
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = np.cumsum(np.linalg.norm(area_vectors(vertices, faces), axis=1))
+    a, b, c = face_corners(vertices, faces)
+    area = np.cumsum(norm(area_vectors(vertices, faces), axis=1))
     face = np.searchsorted(area, (np.arange(count) + 0.5) / count * area[-1])
-    u, v = np.random.default_rng(0).random((2, count, 1))
+    u, v = default_rng(0).random((2, count, 1))
     u, v = np.where(u + v > 1, 1 - u, u), np.where(u + v > 1, 1 - v, v)
     return a[face] + u * (b - a)[face] + v * (c - a)[face], face
 
@@ -299,12 +328,12 @@ FEW_VERTICES = 2500
 """Vertices below which places on the faces stand for a surface: corners of few large triangles do not show it."""
 
 
-def with_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "v 6"]:
+def with_normals(vertices: Vertices, faces: Faces) -> Float[ndarray, "v 6"]:
     """Vertices and their normals, outward as the faces are wound; those of vertices that no face has are 0."""
     return np.hstack([vertices, vertex_normals(Segment("", PALETTE[0], vertices, faces))])
 
 
-def oriented_points(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "n 6"]:
+def oriented_points(vertices: Vertices, faces: Faces) -> Float[ndarray, "n 6"]:
     """Points that stand for a surface: all vertices, or where these are few, points on the faces; with normals."""
     if len(vertices) >= FEW_VERTICES:
         return with_normals(vertices, faces)
@@ -312,7 +341,7 @@ def oriented_points(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "n 6"
     return np.hstack([points, area_vectors(vertices, faces)[face]])
 
 
-def barycentric(triangles: Float[np.ndarray, "n 3 3"], points: Points) -> Float[np.ndarray, "n 3"]:
+def barycentric(triangles: Matrices, points: Points) -> Points:
     """Barycentric coordinates of points in the planes of their triangles."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     normal = np.cross(b - a, c - a)

@@ -3,16 +3,23 @@
 from collections.abc import Collection, Sequence
 from functools import cached_property
 from itertools import combinations
+from math import inf
 from typing import NamedTuple
 
 import igl
 import manifold3d
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from manifold3d import Manifold
+from numpy import ndarray
+from numpy.linalg import norm, svd
 
 from mereo.geometry.brief import counted
+from mereo.geometry.conventions import Names, Pair
+from mereo.geometry.labels import VoxelMask
 from mereo.geometry.mesh import (
     AnyFaces,
+    AnyMesh,
     Segment,
     SegmentedMesh,
     area_vectors,
@@ -20,10 +27,11 @@ from mereo.geometry.mesh import (
     directed_edges,
     edge_imbalance,
     edge_uses,
+    face_corners,
     three_cornered,
 )
 from mereo.geometry.solids import label_grid
-from mereo.geometry.transforms import AnyPoints, Corners, Vector, longest_side
+from mereo.geometry.transforms import AnyPoints, Corners, Vector, box_of, longest_side
 
 MOST_BURIED, MOST_BACKWARDS, MOST_UNDECIDED = 5e-3, 0.05, 0.5
 """Shares of a surface that may lie within the segment, as lips and eyelids do (two rays are compared anyway), face
@@ -44,10 +52,10 @@ class Health(NamedTuple):
     are ``mendable``. ``notes`` do no harm, but change in a repair: fragments, faces without area.
     """
 
-    dirty: tuple[str, ...] = ()
-    hopeless: tuple[str, ...] = ()
+    dirty: Names = ()
+    hopeless: Names = ()
     mendable: bool = True
-    notes: tuple[str, ...] = ()
+    notes: Names = ()
 
     @property
     def sound(self) -> bool:
@@ -78,7 +86,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
     if len(faces) == 0:
         return Health(hopeless=tuple(hopeless), mendable=False)
     corners = vertices[np.unique(faces)] if hopeless else vertices
-    extent = np.linalg.svd(corners - corners.mean(axis=0), compute_uv=False)
+    extent = svd(corners - corners.mean(axis=0), compute_uv=False)
     if len(corners) < 4 or not extent[2] > FLAT * extent[0]:  # in any direction: of float32, a plane is this rough
         return Health(hopeless=(*hopeless, "is flat, without any volume"), mendable=False)
     collapsed = ~three_cornered(faces)
@@ -114,7 +122,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
     return Health(tuple(dirty), tuple(hopeless), notes=notes)
 
 
-def _broken_data(vertices: AnyPoints, faces: AnyFaces) -> tuple[list[str], Bool[np.ndarray, " f"]]:
+def _broken_data(vertices: AnyPoints, faces: AnyFaces) -> tuple[list[str], Bool[ndarray, " f"]]:
     """Faults of the arrays, and which faces can be used all the same."""
     faults = []
     finite = np.isfinite(vertices).all(axis=1)
@@ -134,8 +142,8 @@ def _encloses_nothing(vertices: AnyPoints, faces: AnyFaces) -> bool:
     """Whether a closed mesh has hardly any volume: far less than the thinnest sheet or wire of its size."""
     middle = vertices[faces].mean(axis=(0, 1))
     volume = abs(Segment("", (0, 0, 0), vertices - middle, faces).volume)
-    area = np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()
-    return not volume > 1e-9 * area * float(np.linalg.norm(np.ptp(vertices[np.unique(faces)], axis=0)))
+    area = norm(area_vectors(vertices, faces), axis=1).sum()
+    return not volume > 1e-9 * area * float(norm(np.ptp(vertices[np.unique(faces)], axis=0)))
 
 
 def _wrong_edges(vertices: AnyPoints, faces: AnyFaces, unit: str) -> tuple[int, list[str]]:
@@ -158,7 +166,7 @@ def _wrong_edges(vertices: AnyPoints, faces: AnyFaces, unit: str) -> tuple[int, 
     return len(rim), faults
 
 
-def _notes(vertices: AnyPoints, faces: AnyFaces, surface: "_FrontWinding", unit: str) -> tuple[str, ...]:
+def _notes(vertices: AnyPoints, faces: AnyFaces, surface: "_FrontWinding", unit: str) -> Names:
     notes = []
     stray, what = fragments(vertices, faces, unit)
     if stray.any():
@@ -186,36 +194,36 @@ def faces_astray(vertices: AnyPoints, faces: AnyFaces) -> bool:
 class _FrontWinding(NamedTuple):
     """Winding number before each face that has an area (``proper``), its share of the surface, and its middle."""
 
-    winding: Float[np.ndarray, " p"]
-    share: Float[np.ndarray, " p"]
-    middle: Float[np.ndarray, "p 3"]
-    proper: Bool[np.ndarray, " f"]
+    winding: Float[ndarray, " p"]
+    share: Float[ndarray, " p"]
+    middle: Float[ndarray, "p 3"]
+    proper: Bool[ndarray, " f"]
 
-    def share_where(self, chosen: Bool[np.ndarray, " p"]) -> float:
+    def share_where(self, chosen: Bool[ndarray, " p"]) -> float:
         return float(self.share[chosen].sum())
 
-    def place(self, chosen: Bool[np.ndarray, " p"], unit: str) -> str:
+    def place(self, chosen: Bool[ndarray, " p"], unit: str) -> str:
         """Place of the largest of some faces."""
         return near(self.middle[np.where(chosen, self.share, -1.0).argmax()], unit)
 
 
 def _front_winding(vertices: AnyPoints, faces: AnyFaces) -> _FrontWinding:
     corners = vertices[np.unique(faces)]
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(np.linalg.norm(high - low))
+    low, high = box_of(corners)
+    vertices = (np.where(np.isfinite(vertices), vertices, low) - (low + high) / 2) / float(norm(high - low))
     normal = area_vectors(vertices, faces)
-    area = np.linalg.norm(normal, axis=1)
+    area = norm(normal, axis=1)
     proper = area > 1e-12
-    a, b, c = (vertices[faces[proper, k]] for k in range(3))
+    a, b, c = face_corners(vertices, faces[proper])
     middle = (a + b + c) / 3
     # a ten-thousandth of the box's diagonal before each face; libigl's winding number is in single precision
     front = middle + 1e-4 * normal[proper] / area[proper, None]
     winding = igl.fast_winding_number(vertices, faces.astype(np.int64), front)
-    middle = middle * float(np.linalg.norm(high - low)) + (low + high) / 2
+    middle = middle * float(norm(high - low)) + (low + high) / 2
     return _FrontWinding(winding, area[proper] / max(area.sum(), 1e-300), middle, proper)
 
 
-def pieces(faces: AnyFaces, vertices: int) -> Int[np.ndarray, " f"]:
+def pieces(faces: AnyFaces, vertices: int) -> Int[ndarray, " f"]:
     """Number of the piece of each face; a piece is connected over edges which exactly two of its faces share."""
     edges = np.sort(directed_edges(faces), axis=1) @ [vertices, 1]
     order = np.argsort(edges, kind="stable")
@@ -227,15 +235,15 @@ FRAGMENT = 0.02
 """Diagonal of a fragment's box at most, in those of the whole."""
 
 
-def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Bool[np.ndarray, " f"], str]:
+def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Bool[ndarray, " f"], str]:
     """Faces of pieces that are tiny compared with the whole, and a phrase with their number, share, size and place."""
     piece = pieces(faces, len(vertices))
     corners = vertices[faces]
-    low, high = (np.full((piece.max() + 1, 3), end) for end in (np.inf, -np.inf))
+    low, high = (np.full((piece.max() + 1, 3), end) for end in (inf, -inf))
     np.minimum.at(low, piece, corners.min(axis=1))
     np.maximum.at(high, piece, corners.max(axis=1))
-    size = np.linalg.norm(high - low, axis=1)
-    tiny = size < FRAGMENT * float(np.linalg.norm(high.max(axis=0) - low.min(axis=0)))
+    size = norm(high - low, axis=1)
+    tiny = size < FRAGMENT * float(norm(high.max(axis=0) - low.min(axis=0)))
     if not tiny.any() or tiny.all():
         return np.zeros(len(faces), bool), ""
     stray = tiny[piece]
@@ -243,7 +251,7 @@ def fragments(vertices: AnyPoints, faces: AnyFaces, unit: str = "") -> tuple[Boo
     length = f"{np.ptp([low[largest], high[largest]], axis=0).max():.2g}{unit and f' {unit}'}"
     which = f"the largest {length} long" if tiny.sum() > 1 else f"{length} long"
     where = near((low[largest] + high[largest]) / 2, unit)
-    area = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    area = norm(area_vectors(vertices, faces), axis=1)
     share = f"{100 * area[stray].sum() / max(area.sum(), 1e-300):.2g} % of its surface"
     count = f"{counted(int(tiny.sum()), 'fragment')} ({counted(int(stray.sum()), 'face')}, {share})"
     return stray, f"{count}, {which}, {where}"
@@ -259,23 +267,23 @@ PLAUSIBLE_M = (0.005, 5.0)
 """Longest side of what a depth camera looks at: from 5 mm to 5 m."""
 
 
-def solid_of(vertices: AnyPoints, faces: AnyFaces) -> manifold3d.Manifold:
+def solid_of(vertices: AnyPoints, faces: AnyFaces) -> Manifold:
     """Solid of a closed mesh; raises ``ValueError`` where manifold3d does not accept it."""
     # copies, because manifold3d takes no array that is read-only
     mesh = manifold3d.Mesh64(np.array(vertices, np.float64, order="C"), np.array(faces, np.uint64, order="C"))
-    solid = manifold3d.Manifold(mesh)
+    solid = Manifold(mesh)
     if solid.status() != manifold3d.Error.NoError:
         raise ValueError(f"a mesh of {len(faces)} faces is no solid ({solid.status().name}); it must be closed")
     return solid
 
 
-def mesh_of(solid: manifold3d.Manifold) -> tuple[AnyPoints, AnyFaces]:
+def mesh_of(solid: Manifold) -> AnyMesh:
     """Vertices and faces of a solid."""
     mesh = solid.to_mesh64()
-    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, dtype=np.int64)
+    return np.array(mesh.vert_properties[:, :3]), np.array(mesh.tri_verts, np.int64)
 
 
-def united(pieces: Sequence[Segment]) -> tuple[AnyPoints, AnyFaces]:
+def united(pieces: Sequence[Segment]) -> AnyMesh:
     """Union of pieces, as vertices and faces, where each is a solid that faces outwards; else all of their faces."""
     if len(pieces) == 1:
         return pieces[0].vertices, pieces[0].faces
@@ -283,7 +291,7 @@ def united(pieces: Sequence[Segment]) -> tuple[AnyPoints, AnyFaces]:
         solids = [solid_of(piece.vertices, piece.faces) for piece in pieces]
         if min(solid.volume() for solid in solids) <= 0:
             raise ValueError("a piece is inside out, and would be cut off the others")
-        return mesh_of(manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add))
+        return mesh_of(Manifold.batch_boolean(solids, manifold3d.OpType.Add))
     except ValueError:
         return SegmentedMesh(tuple(pieces)).merged()[:2]
 
@@ -312,7 +320,7 @@ class Overlap(NamedTuple):
 
 
 def overlaps(
-    mesh: SegmentedMesh, tolerance: float = TOLERANCE, among: Collection[tuple[int, int]] | None = None
+    mesh: SegmentedMesh, tolerance: float = TOLERANCE, among: Collection[Pair] | None = None
 ) -> tuple[Overlap, ...]:
     """Pairs of segments that share more than ``tolerance`` of the smaller one, or nest with as much outside.
 
@@ -348,7 +356,7 @@ class _Body:
         self.axes = [low[k] + (np.arange(CELLS) + 0.5) * (high[k] - low[k]) / CELLS for k in range(3)]
 
     @cached_property
-    def solid(self) -> manifold3d.Manifold | None:
+    def solid(self) -> Manifold | None:
         """The solid; None where the mesh is none, or none for manifold3d."""
         if not self.segment.solid:
             return None
@@ -357,12 +365,12 @@ class _Body:
         except ValueError:
             return None
 
-    def held_by(self, segment: Segment) -> Bool[np.ndarray, "x y z"]:
+    def held_by(self, segment: Segment) -> VoxelMask:
         """Whether the centre of each cell lies in a segment."""
         return label_grid(SegmentedMesh((segment,)), *self.axes) > 0
 
     @cached_property
-    def filled(self) -> Bool[np.ndarray, "x y z"]:
+    def filled(self) -> VoxelMask:
         return self.held_by(self.segment)
 
     def share_in(self, other: "_Body") -> float:

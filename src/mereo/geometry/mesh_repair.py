@@ -9,21 +9,26 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import igl
-import manifold3d
 import numpy as np
 from jaxtyping import Bool, Int
+from manifold3d import Manifold, OpType
+from numpy import ndarray
+from numpy.linalg import norm
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
+from mereo.geometry.conventions import Names
 from mereo.geometry.marching_cubes import CORNERS, changing_cells, nodes_of, zero_surface
 from mereo.geometry.mesh import (
     AnyFaces,
+    AnyMesh,
     Segment,
     SegmentedMesh,
     area_vectors,
     connected,
     directed_edges,
     edge_imbalance,
+    face_corners,
     surface_points,
     three_cornered,
     with_used_vertices,
@@ -39,7 +44,7 @@ from mereo.geometry.mesh_check import (
     solid_of,
 )
 from mereo.geometry.solids import search_tree
-from mereo.geometry.transforms import AnyPoints, Flags, Indices, Values, Vector, longest_side, unit_rows
+from mereo.geometry.transforms import AnyPoints, Flags, Indices, Subset, Values, Vector, longest_side, unit_rows
 
 MERGED_WITHIN = (1e-6, 1e-4)
 """Vertices of open edges this near to each other, in diagonals of the box, count as one; the less, where it helps."""
@@ -52,7 +57,7 @@ class Repair(NamedTuple):
     """
 
     segment: Segment
-    changes: tuple[str, ...]
+    changes: Names
     kept: Segment
 
 
@@ -66,7 +71,7 @@ def repaired(segment: Segment, unit: str = "") -> Repair:
         return Repair(segment, (), segment)
     if not health.mendable:
         raise ValueError(lost)
-    changes: list[str] = []
+    changes = list[str]()
     vertices, faces = kept = segment.vertices, segment.faces
     for step in (_drop_unusable, _merge_near, _drop_fragments, _orient, _fill_holes, _unite, _remesh):
         if changes and len(faces) and examine(replace(segment, vertices=vertices, faces=faces)).sound:
@@ -99,7 +104,7 @@ def _drop_unusable(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
 
 def _merge_near(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """Vertices of open edges that are nearly the same, where that closes edges."""
-    diagonal = float(np.linalg.norm(np.ptp(vertices, axis=0)))
+    diagonal = float(norm(np.ptp(vertices, axis=0)))
     best, fewest, change = (vertices, faces), len(open_edges(vertices, faces)), ""
     for distance in (share * diagonal for share in MERGED_WITHIN):
         if fewest:
@@ -111,7 +116,7 @@ def _merge_near(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     return *best, change
 
 
-def _merged(vertices: AnyPoints, faces: AnyFaces, distance: float) -> tuple[AnyPoints, AnyFaces]:
+def _merged(vertices: AnyPoints, faces: AnyFaces, distance: float) -> AnyMesh:
     rim = np.unique(open_edges(vertices, faces))
     pairs = rim[cKDTree(vertices[rim]).query_pairs(distance, output_type="ndarray")].reshape(-1, 2)
     group = connected(pairs, len(vertices))
@@ -159,7 +164,7 @@ def _unite(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
         solid = solid_of(vertices, faces)
     except ValueError:
         return vertices, faces, ""
-    area = float(np.linalg.norm(area_vectors(vertices, faces), axis=1).sum()) / 2
+    area = float(norm(area_vectors(vertices, faces), axis=1).sum()) / 2
     if solid.surface_area() < 0.99 * area:  # manifold3d leaves out what has no volume
         return vertices, faces, ""
     shells = solid.decompose()
@@ -167,7 +172,7 @@ def _unite(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
         return vertices, faces, ""
     filled = [shell for shell in shells if shell.volume() > 0]
     hollow = [solid_of(v, f[:, ::-1]) for v, f in (mesh_of(shell) for shell in shells if shell.volume() < 0)]
-    united = manifold3d.Manifold.batch_boolean(filled, manifold3d.OpType.Add)
+    united = Manifold.batch_boolean(filled, OpType.Add)
     outside = [shell for shell in hollow if (shell ^ united).volume() < 0.5 * shell.volume()]
     for shell in hollow:
         united = united + shell if shell in outside else united - shell
@@ -217,7 +222,7 @@ class _Body:
     """A mesh in cells: which places it encloses, and how far they are from it."""
 
     def __init__(self, vertices: AnyPoints, faces: AnyFaces) -> None:
-        self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
+        self.vertices, self.faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
         self._closed = edge_imbalance(faces) == (0, 0)
         self._tree = search_tree(self.vertices, self.faces)
 
@@ -229,7 +234,7 @@ class _Body:
         """Distance from the surface."""
         return np.sqrt(self._tree.squared_distance(self.vertices, self.faces, places)[0])
 
-    def inside_blocks(self, first: Int[np.ndarray, "b 3"], cell: float) -> Bool[np.ndarray, "b 64"]:
+    def inside_blocks(self, first: Int[ndarray, "b 3"], cell: float) -> Bool[ndarray, "b 64"]:
         """The same for 4 x 4 x 4 nodes from ``first`` on, in cells of a size: far blocks are all in or all out."""
         middle = (first + 1.5) * cell
         winding = igl.fast_winding_number(self.vertices, self.faces, middle)
@@ -254,7 +259,7 @@ class _Body:
         return self.inside(nodes[order[first]])[part]
 
     def samples(
-        self, faces: Int[np.ndarray, " m"], spacing: float, around: AnyPoints | None = None
+        self, faces: Subset, spacing: float, around: AnyPoints | None = None
     ) -> tuple[AnyPoints, AnyPoints, Indices]:
         """Corners of some faces and places about ``spacing`` apart, the normal there, and the face of each.
 
@@ -263,13 +268,13 @@ class _Body:
         chosen = self.faces[faces]
         corners = self.vertices[chosen]
         normal = area_vectors(self.vertices, chosen)
-        area = np.linalg.norm(normal, axis=1)
+        area = norm(normal, axis=1)
         normal /= np.maximum(area, 1e-300)[:, None]
         most = int(np.clip(area.sum() / 2 / spacing**2, 1000, MOST_SAMPLES))
         spread, face = surface_points(self.vertices, chosen, most)
         _, first = np.unique(chosen, return_index=True)
         edges = np.roll(corners, -1, axis=1) - corners  # along which a thin part has places, however small its area is
-        count = np.ceil(np.linalg.norm(edges, axis=2) / spacing).astype(int).ravel()
+        count = np.ceil(norm(edges, axis=2) / spacing).astype(int).ravel()
         row = np.repeat(np.arange(len(count)), np.where(count > 1, np.minimum(count, 1000), 0))
         share = (np.arange(len(row)) - np.searchsorted(row, row)) / np.minimum(count, 1000)[row]
         along = corners.reshape(-1, 3)[row] + share[:, None] * edges.reshape(-1, 3)[row]
@@ -286,7 +291,7 @@ NEIGHBOURS = np.argwhere(np.triu(np.abs(NODES[:, None] - NODES).sum(axis=2) == 1
 """Pairs of nodes of a block."""
 
 
-def _even_surface(body: _Body) -> manifold3d.Manifold:
+def _even_surface(body: _Body) -> Manifold:
     """Surface from cells of one size."""
     shape = np.ceil(body.vertices.max(axis=0) + 2.5 - 1e-9).astype(int)
     blocks = -(-shape // 4)
@@ -294,16 +299,14 @@ def _even_surface(body: _Body) -> manifold3d.Manifold:
     inside = body.inside_blocks(first, 1.0).reshape(*blocks, 4, 4, 4).transpose(0, 3, 1, 4, 2, 5)
     inside = inside.reshape(4 * blocks)[: shape[0], : shape[1], : shape[2]]
     if not inside.any():
-        return manifold3d.Manifold()
+        return Manifold()
     nodes = np.argwhere(nodes_of(changing_cells(inside)))
     field = np.where(inside, 1.0, -1.0)
     field[tuple(nodes.T)] *= np.clip(body.distance(nodes.astype(float)), 1e-3, 1)
     return solid_of(*zero_surface(field)).simplify(0.2)
 
 
-def _with_thin_parts(
-    body: _Body, solid: manifold3d.Manifold
-) -> tuple[manifold3d.Manifold, float, tuple[float, Vector] | None]:
+def _with_thin_parts(body: _Body, solid: Manifold) -> tuple[Manifold, float, tuple[float, Vector] | None]:
     """Solid with finer cells where the old surface is far from it; the least cell; the most still lost, and where.
 
     What is thin breaks into dashes before it vanishes. They are near it, so shells of few cells do not count.
@@ -325,8 +328,8 @@ def _with_thin_parts(
             blocks = _blocks(places[chosen], way[chosen], 16 * finer, FINER * finer)
             if len(blocks) > MOST_BLOCKS:  # of finer cells there would be even more
                 blocks, last = blocks[:MOST_BLOCKS], level + 1
-            cube, corners = manifold3d.Manifold.cube((16 * finer,) * 3), (blocks * 16 * finer).tolist()
-            region = manifold3d.Manifold.batch_boolean([cube.translate(c) for c in corners], manifold3d.OpType.Add)
+            cube, corners = Manifold.cube((16 * finer,) * 3), (blocks * 16 * finer).tolist()
+            region = Manifold.batch_boolean([cube.translate(c) for c in corners], OpType.Add)
             solid, cell = (whole - region) + (_fine_surface(body, blocks, finer) ^ region), finer
     worst = int(np.where(seeds, way, -1.0).argmax())
     lost = (float(way[worst]), places[worst]) if seeds.any() else None
@@ -338,14 +341,14 @@ def _within(places: AnyPoints, of: AnyPoints, distance: float) -> Flags:
     return cKDTree(of).query(places, distance_upper_bound=distance)[0] < distance
 
 
-def _without_specks(solid: manifold3d.Manifold, side: float) -> manifold3d.Manifold:
+def _without_specks(solid: Manifold, side: float) -> Manifold:
     """Solid without shells and cavities of less volume than a cube of a side."""
     shells = solid.decompose()
     kept = [shell for shell in shells if abs(shell.volume()) > side**3]
-    return solid if len(kept) == len(shells) else manifold3d.Manifold.compose(kept)
+    return solid if len(kept) == len(shells) else Manifold.compose(kept)
 
 
-def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[np.ndarray, "b 3"]:
+def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[ndarray, "b 3"]:
     """Blocks of a lattice with a margin around places, those around the largest ``way`` first."""
     shifts = margin * (np.indices((3, 3, 3)).reshape(3, -1).T - 1)
     order = np.argsort(-way, kind="stable")
@@ -354,7 +357,7 @@ def _blocks(places: AnyPoints, way: Values, side: float, margin: float) -> Int[n
     return blocks[np.argsort(first)]
 
 
-def _fine_surface(body: _Body, blocks: Int[np.ndarray, "b 3"], cell: float) -> manifold3d.Manifold:
+def _fine_surface(body: _Body, blocks: Int[ndarray, "b 3"], cell: float) -> Manifold:
     """Surface within blocks of 16 x 16 x 16 cells and one cell around; it is closed along their outside."""
     parts = (4 * blocks[:, None] + np.indices((5, 5, 5)).reshape(3, -1).T).reshape(-1, 3)
     first = 4 * np.unique(parts, axis=0) - 1
@@ -372,14 +375,14 @@ def _fine_surface(body: _Body, blocks: Int[np.ndarray, "b 3"], cell: float) -> m
     corners = corners[(count > 0) & (count < 8)]
     used, corners = np.unique(corners, return_inverse=True)
     if len(used) == 0:
-        return manifold3d.Manifold()
+        return Manifold()
     places = nodes[used] * cell
     field = np.clip(body.distance(places), 1e-3 * cell, cell) * np.where(inside[used], 1.0, -1.0)
     vertices, faces = igl.marching_cubes(field, places, corners.reshape(-1, 8).astype(np.int64), 0.0)[:2]
     return solid_of(vertices, faces.astype(np.int64)).simplify(0.2 * cell)
 
 
-def _cut_off(body: _Body, solid: manifold3d.Manifold, places: AnyPoints, normals: AnyPoints) -> tuple[Values, Flags]:
+def _cut_off(body: _Body, solid: Manifold, places: AnyPoints, normals: AnyPoints) -> tuple[Values, Flags]:
     """Distances from a new solid, and whether a place lies far out of it; a narrow gap that it closes is no loss."""
     if solid.is_empty():
         return np.full(len(places), np.inf), np.ones(len(places), bool)
@@ -430,10 +433,10 @@ def farthest(before: Segment, after: Segment) -> tuple[Reach, Reach]:
     100,000 places between.
     """
     body, other = _Body(before.vertices, before.faces), _Body(after.vertices, after.faces)
-    length = float(np.linalg.norm(np.ptp(before.vertices, axis=0)))
+    length = float(norm(np.ptp(before.vertices, axis=0)))
     places, normals, _ = body.samples(np.arange(len(before.faces)), length / 300)
     way = other.distance(places)
-    reach: dict[bool, Reach] = {}
+    reach = dict[bool, Reach]()
     # the farthest first, for winding numbers of all places would take longer than their distances
     for rows in np.array_split(np.argsort(-way, kind="stable"), 64):
         outer = rows[~body.inside(places[rows] + 1e-4 * length * normals[rows])]
@@ -453,7 +456,7 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
     What sticks out of a segment that it is nested in is cut off. All segments must be solids.
     """
     segments = {segment.name: segment for segment in mesh.segments}
-    changes: dict[str, list[str]] = {}
+    changes = dict[str, list[str]]()
     for overlap in overlaps(mesh):
         pair = segments[overlap.small], segments[overlap.large]
         small, large = (solid_of(segment.vertices, segment.faces) for segment in pair)
@@ -473,7 +476,7 @@ def without_overlaps(mesh: SegmentedMesh) -> tuple[SegmentedMesh, dict[str, list
 def _without_flecks(vertices: AnyPoints, faces: AnyFaces) -> Step:
     """Mesh without pieces of hardly any volume: Booleans of meshes that nearly touch leave them."""
     piece = pieces(faces, len(vertices))
-    a, b, c = (vertices[faces[:, k]] - vertices.mean(axis=0) for k in range(3))
+    a, b, c = face_corners(vertices - vertices.mean(axis=0), faces)
     volume = np.abs(np.bincount(piece, weights=np.einsum("ij,ij->i", a, np.cross(b, c))))
     kept = volume > 1e-5 * volume.max()
     share = 100 * volume[~kept].sum() / volume.sum()
@@ -484,20 +487,20 @@ def _without_flecks(vertices: AnyPoints, faces: AnyFaces) -> Step:
 # --- the largest piece, and holes -------------------------------------------------------------------------------------
 
 
-def largest_piece(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, AnyFaces]:
+def largest_piece(vertices: AnyPoints, faces: AnyFaces) -> AnyMesh:
     """Piece of the most faces; unused vertices are left out."""
     piece = pieces(faces, len(vertices))
     return with_used_vertices(vertices, faces[piece == np.bincount(piece).argmax()])
 
 
-def open_edges(vertices: AnyPoints, faces: AnyFaces) -> Int[np.ndarray, "_ 2"]:
+def open_edges(vertices: AnyPoints, faces: AnyFaces) -> Int[ndarray, "_ 2"]:
     """Directed edges that no face takes the other way, in the order of faces."""
     directed = directed_edges(faces)
     forth, back = directed @ [len(vertices), 1], directed @ [1, len(vertices)]
     return directed[~np.isin(forth, back)]
 
 
-def close_holes(vertices: AnyPoints, faces: AnyFaces) -> tuple[AnyPoints, AnyFaces]:
+def close_holes(vertices: AnyPoints, faces: AnyFaces) -> AnyMesh:
     """Mesh whose open loops are closed by fans around the mean of their vertices; a closed mesh stays as it is."""
     rim = open_edges(vertices, faces)
     if len(rim) == 0:

@@ -5,13 +5,14 @@ from dataclasses import dataclass, replace
 from math import isnan
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Integer, UInt8
+from jaxtyping import Float, Int, Integer
+from numpy import ndarray
 
-from mereo.geometry.labels import LabelGrid
+from mereo.geometry.labels import GridLabels, LabelGrid, VoxelMask
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import label_grid
 
-Confusion = Int[np.ndarray, "c c"]
+Confusion = Int[ndarray, "c c"]
 """Numbers of places, by their true label and the predicted one."""
 
 
@@ -27,12 +28,10 @@ class Scores:
 
     iou: float
     miou: float
-    per_segment: Float[np.ndarray, " s"]
+    per_segment: Float[ndarray, " s"]
 
 
-def confusion_matrix(
-    truth: Integer[np.ndarray, "*n"], prediction: Integer[np.ndarray, "*n"], classes: int
-) -> Confusion:
+def confusion_matrix(truth: Integer[ndarray, "*n"], prediction: Integer[ndarray, "*n"], classes: int) -> Confusion:
     """Counts of points by true class (row) and predicted class (column)."""
     index = truth.astype(np.int64).ravel() * classes + prediction.astype(np.int64).ravel()
     return np.bincount(index, minlength=classes * classes).reshape(classes, classes)
@@ -87,7 +86,7 @@ class TruthGrid:
     """
 
     grid: LabelGrid
-    kept: Bool[np.ndarray, "x y z"]
+    kept: VoxelMask
 
     def scaled(self, factor: float) -> "TruthGrid":
         """The same with all lengths ``factor`` times as long."""
@@ -101,7 +100,7 @@ def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
     spacing = (high - low) / cells
     origin = low + spacing / 2
     x, y, z = (origin[axis] + np.arange(cells) * spacing[axis] for axis in range(3))
-    kept = np.zeros((cells, cells, cells), dtype=bool)
+    kept = np.zeros((cells, cells, cells), bool)
     for segment in mesh.segments:
         first, last = segment.bounds
         margin = 0.25 * (last - first)  # on each side: 50 % in all, as in the paper
@@ -110,16 +109,16 @@ def truth_grid(mesh: SegmentedMesh, cells: int = 100) -> TruthGrid:
     return TruthGrid(LabelGrid(label_grid(mesh, x, y, z), origin, spacing, mesh.names), kept)
 
 
-def grid_confusion(truth: TruthGrid, predicted: UInt8[np.ndarray, "x y z"], segments: int) -> Confusion:
+def grid_confusion(truth: TruthGrid, predicted: GridLabels, segments: int) -> Confusion:
     """Confusion matrix of the points that count; where the model knows one segment, all true ones are taken as one."""
     labels = np.minimum(truth.grid.labels[truth.kept], segments)
     return confusion_matrix(labels, np.minimum(predicted[truth.kept], segments), segments + 1)
 
 
-def labels_on(surfaces: SegmentedMesh, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
+def labels_on(surfaces: SegmentedMesh, grid: LabelGrid) -> GridLabels:
     """Labels of surfaces on a grid in their axes and unit; segments without faces are nowhere."""
     present = [number for number, segment in enumerate(surfaces.segments) if len(segment.faces)]
     if not present:
         return np.zeros_like(grid.labels)
     labels = label_grid(SegmentedMesh(tuple(surfaces.segments[number] for number in present)), *grid.axes())
-    return np.array([0, *(number + 1 for number in present)], dtype=np.uint8)[labels]
+    return np.array([0, *(number + 1 for number in present)], np.uint8)[labels]

@@ -6,13 +6,15 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
+from numpy import ndarray
 from scipy.spatial import cKDTree
 
+from mereo.geometry.conventions import WholeNumbers
 from mereo.geometry.labels import LabelGrid
-from mereo.geometry.mesh import Color
+from mereo.geometry.mesh import Color, Colors, SegmentColors
 from mereo.geometry.transforms import Points, Values
 
-STOPS: tuple[Color, ...] = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
+STOPS: SegmentColors = ((214, 224, 234), (250, 205, 120), (226, 98, 62), (122, 24, 70))
 """Colours from a radius of none to ``Radii.high``: pale is sure, dark red is not."""
 
 
@@ -28,14 +30,14 @@ class Radii:
         calibrated: whether the radii were calibrated on training views of the object.
     """
 
-    points: Float[np.ndarray, "m 3"]
-    labels: UInt8[np.ndarray, " m"]
-    values: Float[np.ndarray, " m"]
-    counts: tuple[int, ...]
+    points: Float[ndarray, "m 3"]
+    labels: UInt8[ndarray, " m"]
+    values: Float[ndarray, " m"]
+    counts: WholeNumbers
     calibrated: bool
 
     @property
-    def vertices(self) -> tuple[Float[np.ndarray, " v"], ...]:
+    def vertices(self) -> tuple[Float[ndarray, " v"], ...]:
         """Radii of the vertices of each segment."""
         ends = np.cumsum(self.counts)
         return tuple(np.split(self.values[: ends[-1]], ends[:-1]))
@@ -45,7 +47,7 @@ class Radii:
         """Radius at which colours end: the greatest but for a twentieth of the vertices."""
         return float(np.quantile(self.values[: sum(self.counts)], 0.95))
 
-    def colors(self, values: Values) -> UInt8[np.ndarray, "n 3"]:
+    def colors(self, values: Values) -> Colors:
         """Colours (red, green, blue) of radii."""
         return between_stops(values / max(self.high, 1e-30), STOPS).round().astype(np.uint8)
 
@@ -63,12 +65,11 @@ class Radii:
         tree, values = self._trees[label]
         distance, near = tree.query(places, k=range(1, min(4, len(values)) + 1))  # a radius is smooth
         weight = 1.0 / np.maximum(distance, 1e-12 * max(1.0, float(np.abs(self.points).max()))) ** 2
-        result: np.ndarray = (weight * values[near]).sum(axis=1) / weight.sum(axis=1)
-        return result
+        return (weight * values[near]).sum(axis=1) / weight.sum(axis=1)
 
-    def on_grid(self, grid: LabelGrid) -> Float32[np.ndarray, "x y z"]:
+    def on_grid(self, grid: LabelGrid) -> Float32[ndarray, "x y z"]:
         """Radii at the centres of the voxels of each segment, to three digits; NaN in empty space."""
-        result = np.full(grid.labels.shape, np.nan, dtype=np.float32)
+        result = np.full(grid.labels.shape, np.nan, np.float32)
         for label in self._trees:
             index = np.argwhere(grid.labels == label)
             if len(index):
@@ -85,15 +86,14 @@ def describe_level(calibrated: bool) -> str:
 def rounded_to(values: Values, digits: int) -> Values:
     """Positive numbers to this many decimal digits."""
     unit = 10.0 ** (np.floor(np.log10(np.maximum(values, np.finfo(np.float64).tiny))) - digits + 1)
-    result: np.ndarray = np.round(values / unit) * unit
-    return result
+    return np.round(values / unit) * unit
 
 
-def between_stops(shares: Values, stops: Sequence[Color]) -> Float[np.ndarray, "n 3"]:
+def between_stops(shares: Values, stops: Sequence[Color]) -> Points:
     """Colours (red, green, blue, 0 to 255) of shares, linear between stops at equal distances.
 
     What lies below 0 or above 1 has the colour of that end; NaN stays NaN.
     """
     places = np.clip(shares, 0.0, 1.0) * (len(stops) - 1)
-    columns = np.asarray(stops, dtype=float).T
+    columns = np.asarray(stops, float).T
     return np.stack([np.interp(places, np.arange(len(stops)), column) for column in columns], axis=1)

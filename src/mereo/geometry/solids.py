@@ -10,16 +10,18 @@ is the depth and a direction's x and y are its slopes.
 """
 
 from functools import cached_property
+from math import inf
 from typing import NamedTuple
 
 import igl
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
 from scipy.sparse import csr_array
 
-from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_vectors
+from mereo.geometry.mesh import Faces, Segment, SegmentedMesh, Vertices, area_vectors, face_corners
 from mereo.geometry.read_only import read_only
-from mereo.geometry.transforms import Flags, Indices, Labels, Points, Values, Vector, unit_rows
+from mereo.geometry.transforms import Flags, Indices, Labels, Points, Subset, Values, Vector, unit_rows
 
 _DIRECTIONS = read_only(np.array([[0.4637, 0.5718, 0.6767], [-0.7301, 0.3469, -0.5887]]))
 """Two generic directions: not along any axis, face diagonal or each other."""
@@ -39,7 +41,7 @@ class Hits(NamedTuple):
     distance: Values
     normal: Points
 
-    def nearer(self, rows: Int[np.ndarray, " m"], others: "Hits") -> Int[np.ndarray, " k"]:
+    def nearer(self, rows: Subset, others: "Hits") -> Int[ndarray, " k"]:
         """Rows of ``rows`` on which the ``others`` meet something nearer, which these hits take over, in place."""
         better = others.distance < self.distance[rows]
         kept = rows[better]
@@ -47,7 +49,7 @@ class Hits(NamedTuple):
         return kept
 
 
-def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m"]:
+def toward(directions: Points, low: Vector, high: Vector) -> Subset:
     """Rays that may hit the box from ``low`` to ``high``: all of them where it is not wholly in front of the camera.
 
     A segment covers a small part of an image, and a ray that misses costs as much as one that hits.
@@ -62,7 +64,7 @@ def toward(directions: Points, low: Vector, high: Vector) -> Int[np.ndarray, " m
     return np.flatnonzero((x >= x0) & (x <= x1) & (y >= y0) & (y <= y1))
 
 
-def search_tree(vertices: Vertices, elements: Int[np.ndarray, "m k"]) -> igl.AABB:
+def search_tree(vertices: Vertices, elements: Int[ndarray, "m k"]) -> igl.AABB:
     """Tree in which libigl finds the nearest of triangles, or the tetrahedron around a point."""
     tree = igl.AABB()
     tree.init(vertices, elements)
@@ -71,7 +73,7 @@ def search_tree(vertices: Vertices, elements: Int[np.ndarray, "m k"]) -> igl.AAB
 
 def cast_rays(
     tree: igl.AABB, vertices: Vertices, faces: Faces, origins: Points, directions: Points
-) -> tuple[Indices, Values, Float[np.ndarray, "n 2"]]:
+) -> tuple[Indices, Values, Float[ndarray, "n 2"]]:
     """Find what each ray ``origin + t * direction`` meets first of the triangles of a tree.
 
     Returns the face, -1 where there is none, t, and the weights of the face's second and third corner; the latter two
@@ -93,8 +95,8 @@ class _Solid:
     """One closed segment with its search structures, built on first use."""
 
     def __init__(self, segment: Segment) -> None:
-        self.vertices = np.ascontiguousarray(segment.vertices, dtype=np.float64)
-        self.faces = np.ascontiguousarray(segment.faces, dtype=np.int64)
+        self.vertices = np.ascontiguousarray(segment.vertices, float)
+        self.faces = np.ascontiguousarray(segment.faces, np.int64)
         self.is_solid = segment.solid
         self.low, self.high = segment.bounds
 
@@ -109,7 +111,7 @@ class _Solid:
 
     def in_box(self, points: Points) -> Flags:
         """Whether points lie strictly in the segment's box, outside of which nothing is inside."""
-        result = np.ones(len(points), dtype=bool)
+        result = np.ones(len(points), bool)
         for axis in range(3):  # several times faster than all three at once
             result &= (points[:, axis] > self.low[axis]) & (points[:, axis] < self.high[axis])
         return result
@@ -117,7 +119,7 @@ class _Solid:
     def holds(self, points: Points) -> Flags:
         """Whether points, already known to lie in the box, are inside."""
         if len(points) == 0:
-            return np.zeros(0, dtype=bool)
+            return np.zeros(0, bool)
         if not self.is_solid:
             return igl.fast_winding_number(self.vertices, self.faces, points) > 0.5
         first, second = self._behind_first_hit(points)
@@ -126,14 +128,14 @@ class _Solid:
             first[doubtful] = igl.fast_winding_number(self.vertices, self.faces, points[doubtful]) > 0.5
         return first
 
-    def _behind_first_hit(self, points: Points) -> Bool[np.ndarray, "2 n"]:
+    def _behind_first_hit(self, points: Points) -> Bool[ndarray, "2 n"]:
         """For each of two rays whether the first face it hits is seen from behind."""
         directions = np.repeat(_DIRECTIONS, len(points), axis=0)
         face = cast_rays(self.tree, self.vertices, self.faces, np.tile(points, (2, 1)), directions)[0]
         behind = np.einsum("ni,ni->n", self.normals[face], directions) > 0
         return (behind & (face >= 0)).reshape(2, -1)
 
-    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Subset, Hits]:
         """Which rays from the origin hit the segment, and where each of them does first."""
         rows = toward(directions, self.low, self.high)
         face, share, _ = cast_rays(self.tree, self.vertices, self.faces, np.zeros((len(rows), 3)), directions[rows])
@@ -178,10 +180,10 @@ class Solids:
         self._solids = [_Solid(segment) for segment in mesh.segments]
 
     @cached_property
-    def _merged(self) -> tuple[Vertices, Faces, Int[np.ndarray, " f"]]:
+    def _merged(self) -> tuple[Vertices, Faces, Int[ndarray, " f"]]:
         return self.mesh.merged()
 
-    def boxes(self) -> Float[np.ndarray, "s 2 3"]:
+    def boxes(self) -> Float[ndarray, "s 2 3"]:
         """Axis-aligned boxes of the segments."""
         return np.stack([[solid.low, solid.high] for solid in self._solids])
 
@@ -200,7 +202,7 @@ class Solids:
         pocket of winding number -1 from behind, and a point outside then counts as inside: of the built-in scenes six
         in 10,000 within 0.1 units of the skull's cranium.
         """
-        labels = np.zeros(len(points), dtype=np.uint8)
+        labels = np.zeros(len(points), np.uint8)
         for index, solid in enumerate(self._solids):
             candidates = np.flatnonzero((labels == 0) & solid.in_box(points))
             labels[candidates[solid.holds(points[candidates])]] = index + 1
@@ -216,8 +218,8 @@ class Solids:
         outside = (np.maximum(np.maximum(each.low - points, points - each.high), 0.0) for each in self._solids)
         bounds = np.stack([np.einsum("ij,ij->i", offset, offset) for offset in outside])
         likely = bounds.argmin(axis=0)
-        squared, place = np.full(len(points), np.inf), np.empty_like(points)
-        face, owner = np.empty(len(points), dtype=np.int64), np.empty(len(points), dtype=np.int64)
+        squared, place = np.full(len(points), inf), np.empty_like(points)
+        face, owner = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
         first_faces = np.cumsum([0, *(len(solid.faces) for solid in self._solids)])
         # first the segment whose box is nearest, then those whose boxes are nearer than what it gave: one to two each
         for again in (False, True):
@@ -232,7 +234,7 @@ class Solids:
 
     def first_hit(self, directions: Points) -> Hits:
         """First meetings of rays ``t * direction`` from the origin with any surface, t > 0; directions have z = 1."""
-        hits = Hits(np.full(len(directions), np.inf), np.zeros((len(directions), 3)))
+        hits = Hits(np.full(len(directions), inf), np.zeros((len(directions), 3)))
         for solid in self._solids:
             hits.nearer(*solid.first_hit(directions))
         return hits
@@ -263,14 +265,14 @@ def signed_distance_and_direction(
 
 
 def label_grid(
-    mesh: SegmentedMesh, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
-) -> UInt8[np.ndarray, "nx ny nz"]:
+    mesh: SegmentedMesh, x: Float[ndarray, " nx"], y: Float[ndarray, " ny"], z: Float[ndarray, " nz"]
+) -> UInt8[ndarray, "nx ny nz"]:
     """Exact labels on the product grid of three ascending coordinate arrays; the first segment wins an overlap.
 
     Signed crossings are counted along columns instead of testing every node, see ``winding_number``: a closed segment
     has no cracks, and a node exactly on a surface has the label of the node just above it.
     """
-    labels = np.zeros((len(x), len(y), len(z)), dtype=np.uint8)
+    labels = np.zeros((len(x), len(y), len(z)), np.uint8)
     for index, segment in enumerate(mesh.segments):
         box = tuple(
             slice(int(np.searchsorted(axis, low)), int(np.searchsorted(axis, high, "right")))
@@ -297,8 +299,8 @@ def label_grid(
 
 
 def winding_grid(
-    segment: Segment, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], z: Float[np.ndarray, " nz"]
-) -> Bool[np.ndarray, "nx ny nz"]:
+    segment: Segment, x: Float[ndarray, " nx"], y: Float[ndarray, " ny"], z: Float[ndarray, " nz"]
+) -> Bool[ndarray, "nx ny nz"]:
     """Whether each node of the product grid of three ascending coordinate arrays is inside a closed mesh."""
     corners = segment.vertices[segment.faces]
     triangle, i, j = _covered_columns(corners[..., :2], x, y)
@@ -309,24 +311,24 @@ def winding_grid(
     heights, weights = corners[triangle[hit]][..., 2], weights[hit]
     height = (weights * heights).sum(axis=1) / weights.sum(axis=1)
     height = np.clip(height, heights.min(axis=1), heights.max(axis=1))  # so that level faces stay level
-    crossings = np.zeros((len(x), len(y), len(z) + 1), dtype=np.int32)
+    crossings = np.zeros((len(x), len(y), len(z) + 1), np.int32)
     np.add.at(crossings, (i[hit], j[hit], np.searchsorted(z, height)), step)
     return crossings.cumsum(axis=2)[..., :-1] > 0
 
 
 def _edge_sides(
-    corners: Float[np.ndarray, "p 3 2"],
-    ids: Int[np.ndarray, "p 3"],
-    x: Float[np.ndarray, " p"],
-    y: Float[np.ndarray, " p"],
-) -> tuple[Float[np.ndarray, "p 3"], Bool[np.ndarray, "p 3"]]:
+    corners: Float[ndarray, "p 3 2"],
+    ids: Int[ndarray, "p 3"],
+    x: Float[ndarray, " p"],
+    y: Float[ndarray, " p"],
+) -> tuple[Float[ndarray, "p 3"], Bool[ndarray, "p 3"]]:
     """Barycentric weights (not normalized) of columns in triangles, and whether each is left of the opposite edge.
 
     All triangles of an edge evaluate it from its lower vertex and so agree bit for bit. A column exactly on the edge
     is moved by (e, e^2), e infinitely small (Edelsbrunner and Muecke's simulation of simplicity): then vertices too
     are on one side of everything.
     """
-    weights, left = np.empty((len(x), 3)), np.empty((len(x), 3), dtype=bool)
+    weights, left = np.empty((len(x), 3)), np.empty((len(x), 3), bool)
     for k in range(3):
         a, b = (k + 1) % 3, (k + 2) % 3
         swap = ids[:, a] > ids[:, b]
@@ -340,8 +342,8 @@ def _edge_sides(
 
 
 def _covered_columns(
-    corners: Float[np.ndarray, "f 3 2"], x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"]
-) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    corners: Float[ndarray, "f 3 2"], x: Float[ndarray, " nx"], y: Float[ndarray, " ny"]
+) -> tuple[Int[ndarray, " p"], Int[ndarray, " p"], Int[ndarray, " p"]]:
     """Pairs (triangle, column i, column j) whose column lies in the triangle's projected box."""
     low, high = corners.min(axis=1), corners.max(axis=1)
     first_i, first_j = np.searchsorted(x, low[:, 0]), np.searchsorted(y, low[:, 1])
@@ -356,23 +358,23 @@ def _covered_columns(
 # --- moments ----------------------------------------------------------------------------------------------------------
 
 
-def owned_centroids(mesh: SegmentedMesh) -> Float[np.ndarray, "s 3"]:
+def owned_centroids(mesh: SegmentedMesh) -> Float[ndarray, "s 3"]:
     """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
     volumes, moments = mesh.owned_volumes, np.stack([_first_moment(segment) for segment in mesh.segments])
     for outer in range(len(moments)):  # the inner ones come first and are done
         moments[outer] -= sum((moments[inner] for inner, other in mesh.nesting if other == outer), np.zeros(3))
-    return np.asarray(moments / volumes[:, None])
+    return moments / volumes[:, None]
 
 
 def _first_moment(segment: Segment) -> Vector:
     """Volume times centroid of a closed mesh (divergence theorem), by tetrahedra with one corner at its middle."""
     middle = segment.vertices.mean(axis=0)
-    a, b, c = (segment.vertices[segment.faces[:, i]] - middle for i in range(3))
+    a, b, c = face_corners(segment.vertices - middle, segment.faces)
     volume = np.einsum("ij,ij->i", a, np.cross(b, c)) / 6.0
-    return np.asarray((volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle)
+    return (volume[:, None] * (a + b + c)).sum(axis=0) / 4.0 + volume.sum() * middle
 
 
-def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
+def owned_gradients(mesh: SegmentedMesh) -> Float[ndarray, "s 4 v 3"]:
     """Derivatives of each segment's own volume, then of its centroid's x, y, z, by the vertices of all segments.
 
     The vertices are those of ``mesh.merged()``.
@@ -392,7 +394,7 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[np.ndarray, "s 4 v 3"]:
     return result
 
 
-def _gradients(segment: Segment, origin: Vector) -> Float[np.ndarray, "4 v 3"]:
+def _gradients(segment: Segment, origin: Vector) -> Float[ndarray, "4 v 3"]:
     """Derivatives of a mesh's volume, and of its first moment about an origin, by its vertices."""
     corners = segment.vertices[segment.faces] - origin
     area = np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]) / 6.0  # of the volume, by each corner
@@ -404,5 +406,5 @@ def _gradients(segment: Segment, origin: Vector) -> Float[np.ndarray, "4 v 3"]:
     collect = csr_array(
         (np.ones(len(columns)), (segment.faces.ravel(), columns)), (len(segment.vertices), len(columns))
     )
-    gradients: np.ndarray = (collect @ each).reshape(-1, 4, 3)
+    gradients = (collect @ each).reshape(-1, 4, 3)
     return gradients.transpose(1, 0, 2)

@@ -5,26 +5,24 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from numpy.linalg import norm
 
-from mereo.geometry.mesh import AnyFaces, Faces, Segment, Vertices, connected, directed_edges
+from mereo.geometry.mesh import AnyFaces, ChangedMesh, Faces, Segment, Vertices, connected, directed_edges, face_corners
 from mereo.geometry.transforms import Indices
 
-TooLong = Callable[[Float[np.ndarray, "e 2 3"]], Bool[np.ndarray, " e"]]
+TooLong = Callable[[Float[ndarray, "e 2 3"]], Bool[ndarray, " e"]]
 """Which edges are to be halved, by the places of their ends; the order of the two must not matter."""
 
 
-def split_long_edges(
-    vertices: Vertices, faces: Faces, longest: float, most: int
-) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+def split_long_edges(vertices: Vertices, faces: Faces, longest: float, most: int) -> ChangedMesh:
     """The same surface without edges over ``longest``; the given vertices come first and keep their places.
 
     Both triangles at an edge are split there, so that closed meshes stay closed. Raises ``ValueError`` where that takes
     more than ``most`` faces.
     """
     try:
-        return split_edges(
-            vertices, faces, lambda ends: np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1) > longest, most
-        )
+        return split_edges(vertices, faces, lambda ends: norm(ends[:, 0] - ends[:, 1], axis=1) > longest, most)
     except TooManyFaces:
         raise ValueError(
             f"a mesh would take {most:,} triangles or more to have no edge over {longest:.3g}; it is too large, or "
@@ -36,21 +34,19 @@ class TooManyFaces(ValueError):
     """Error of a subdivision that takes more faces than are allowed."""
 
 
-def split_edges(
-    vertices: Vertices, faces: Faces, too_long: TooLong, most: int
-) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+def split_edges(vertices: Vertices, faces: Faces, too_long: TooLong, most: int) -> ChangedMesh:
     """The same surface with all edges halved, and their halves again, that are ``too_long``; each is tested once.
 
     The given vertices come first. Both triangles at an edge are split there, so that closed meshes stay closed. Raises
     ``TooManyFaces`` where that takes more than ``most``.
     """
     faces = faces.astype(np.int64)
-    short: Int[np.ndarray, " k"] = np.empty(0, dtype=np.int64)
+    short = np.empty(0, np.int64)
     while True:
         edges, edge_of = _edges(faces)
         keys = edges[:, 0] << 32 | edges[:, 1]
         new = ~np.isin(keys, short)
-        long = np.zeros(len(edges), dtype=bool)
+        long = np.zeros(len(edges), bool)
         long[new] = too_long(vertices[edges[new]])
         if not long.any():
             return vertices, faces
@@ -61,14 +57,14 @@ def split_edges(
             raise TooManyFaces(f"a mesh would take {most:,} triangles or more")
 
 
-def _edges(faces: AnyFaces) -> tuple[Int[np.ndarray, "e 2"], Int[np.ndarray, "_ 3"]]:
+def _edges(faces: AnyFaces) -> tuple[Int[ndarray, "e 2"], AnyFaces]:
     """All edges, and for each face which they are: edge k leads from corner k to the next."""
     ends = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=2).reshape(-1, 2), axis=1)
     edges, inverse = np.unique(ends, axis=0, return_inverse=True)
     return edges, inverse.reshape(-1, 3)
 
 
-def _split(faces: AnyFaces, middle: Int[np.ndarray, "_ 3"], long: Bool[np.ndarray, "_ 3"]) -> AnyFaces:
+def _split(faces: AnyFaces, middle: AnyFaces, long: Bool[ndarray, "_ 3"]) -> AnyFaces:
     """Faces after halving their long edges, whose new vertices are ``middle``."""
     result = [faces[~long.any(axis=1)]]
     for count in (1, 2, 3):
@@ -96,8 +92,8 @@ CREASE_DEG = 30.0
 """Angle between the normals of two neighbouring faces above which the edge between them is a crease."""
 
 
-def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[Segment, Indices]:
-    """The same surface, its vertices split where faces meet at a crease: normals are farther apart than ``angle_deg``.
+def split_at_creases(segment: Segment) -> tuple[Segment, Indices]:
+    """The same surface, its vertices split where faces meet at a crease: normals are farther apart than ``CREASE_DEG``.
 
     A vertex is split into as many as there are groups of faces around it between which only creases lie; where a crease
     ends within a smooth surface there is one such group, and it stays one vertex. Faces without area have no normal and
@@ -116,10 +112,10 @@ def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[S
     cosine = np.einsum("ni,ni->n", normals[first], normals[second])
     has_normals = ~(is_flat[first] | is_flat[second])
     # a cylinder of twelve sides has exactly 30 degrees at each edge, up to rounding
-    is_crease = has_normals & (cosine < np.cos(np.deg2rad(angle_deg + 0.01)))
+    is_crease = has_normals & (cosine < np.cos(np.deg2rad(CREASE_DEG + 0.01)))
     if not is_crease.any():
         return segment, same
-    on_crease = np.zeros(count, dtype=bool)
+    on_crease = np.zeros(count, bool)
     on_crease[edge[is_crease]] = True
     is_smooth = has_normals & ~is_crease
     group = _groups(faces, (first[is_smooth], second[is_smooth], edge[is_smooth]), on_crease)
@@ -134,18 +130,18 @@ def split_at_creases(segment: Segment, angle_deg: float = CREASE_DEG) -> tuple[S
     return replace(segment, vertices=segment.vertices[source], faces=corner.reshape(-1, 3)), source
 
 
-def _face_normals(segment: Segment) -> Float[np.ndarray, "f 3"]:
+def _face_normals(segment: Segment) -> Float[ndarray, "f 3"]:
     """Unit normals of the faces; zero for those without area."""
-    a, b, c = (segment.vertices[segment.faces[:, k]].astype(np.float64) for k in range(3))
+    a, b, c = face_corners(segment.vertices.astype(float), segment.faces)
     normals = np.cross(b - a, c - a)
-    area = np.linalg.norm(normals, axis=1, keepdims=True)
+    area = norm(normals, axis=1, keepdims=True)
     longest = np.max([((q - p) ** 2).sum(axis=1) for p, q in ((a, b), (b, c), (c, a))], axis=0)[:, None]
     return np.where(area > 1e-12 * longest, normals / np.maximum(area, 1e-300), 0.0)
 
 
 def _neighbours(
     faces: Faces,
-) -> tuple[Indices, Indices, Int[np.ndarray, "n 2"]]:
+) -> tuple[Indices, Indices, Int[ndarray, "n 2"]]:
     """Pairs of faces with a common edge, and its two vertices; of more than two at an edge each with the next."""
     edges = np.sort(directed_edges(faces), axis=1)
     key = edges[:, 0] * (int(faces.max()) + 1) + edges[:, 1]
@@ -157,9 +153,9 @@ def _neighbours(
 
 def _groups(
     faces: Faces,
-    smooth: tuple[Indices, Indices, Int[np.ndarray, "n 2"]],
-    on_crease: Bool[np.ndarray, " v"],
-) -> Int[np.ndarray, " c"]:
+    smooth: tuple[Indices, Indices, Int[ndarray, "n 2"]],
+    on_crease: Bool[ndarray, " v"],
+) -> Int[ndarray, " c"]:
     """Number of the group of each corner of each face: corners at one vertex between which no crease lies share it.
 
     ``smooth`` are neighbours without a crease between them, as ``_neighbours`` has them.

@@ -7,11 +7,16 @@ right at it in space, where it turns away from the camera, is its own. Measured 
 Notation: n points, k neighbours.
 """
 
+from math import nan
+
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy import ndarray
+from numpy.linalg import norm, solve
 from scipy.spatial import cKDTree
 from scipy.stats import median_abs_deviation
 
+from mereo.geometry.camera import PixelValues
 from mereo.geometry.downsampling import MAX_POINTS, thin_to_grid
 from mereo.geometry.mesh import connected
 from mereo.geometry.transforms import Flags, Indices, Points, Values, longest_side
@@ -54,7 +59,7 @@ def surface_patches(points: Points) -> tuple[Indices, Flags]:
     rows = thin_to_grid(points, MAX_POINTS)
     places, place = np.unique(points[rows], axis=0, return_inverse=True)
     if len(places) <= NEIGHBORS + 1:
-        return np.zeros(len(points), dtype=np.int64), np.ones(len(points), dtype=bool)
+        return np.zeros(len(points), np.int64), np.ones(len(points), bool)
     patch, inner, tall = _patches(places)
     surface = np.bincount(patch, inner)[patch] > 0
     if not surface.any():
@@ -69,7 +74,7 @@ def _patches(
     points: Points,
 ) -> tuple[Indices, Flags, Values]:
     """Number of the patch of each of many different points, whether it is an inner one, and its largest step."""
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     sight = points / np.maximum(distance, np.finfo(float).tiny)[:, None]
     angle, neighbor = cKDTree(sight).query(sight, k=NEIGHBORS + 1)
     angle, neighbor = angle[:, 1:], neighbor[:, 1:]
@@ -95,7 +100,7 @@ def without_strays(points: Points) -> Flags:
     """Whether each point is left where strays are removed: all are, unless strays make the box ``STRETCH`` longer."""
     keep = surface_points(points)
     if keep.all() or stretch(points, keep) <= STRETCH:
-        return np.ones(len(points), dtype=bool)
+        return np.ones(len(points), bool)
     return keep
 
 
@@ -120,7 +125,7 @@ def smoothed(points: Points) -> Points:
     """Points moved along their lines of sight, from the origin, to where their neighbours on the surface say it is."""
     if len(points) < FEWEST:
         return points
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     sight = points / distance[:, None]
     angle, neighbor = cKDTree(sight).query(sight, k=min(SIGHT_NEIGHBORS + 1, len(points)))
     radius = RADIUS * float(np.median(angle[:, FEWEST]))
@@ -148,7 +153,7 @@ def roughness(points: Points, normals: Points | None = None) -> float:
     free = count - len(RIDGE)
     if free < 1:
         return float("inf")
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     sight = points / distance[:, None]
     places, axis = (sight, sight) if normals is None else (points, normals)
     apart, neighbor = cKDTree(places).query(places, k=count)
@@ -159,13 +164,13 @@ def roughness(points: Points, normals: Points | None = None) -> float:
         unit = np.ones(len(points))
     terms = _quadratic(places, axis, neighbor, radius)
     patch = _fit_patches(terms, np.ones_like(value), value, (1e-6,) * len(RIDGE))  # rows of points leave it open
-    away = np.linalg.norm(value - np.einsum("nki,ni->nk", terms, patch), axis=1) * unit
+    away = norm(value - np.einsum("nki,ni->nk", terms, patch), axis=1) * unit
     return float(np.quantile(away, CALM)) / float(np.sqrt(free))
 
 
 def _on_same_surface(
-    distance: Values, angle: Float[np.ndarray, "n k"], neighbor: Int[np.ndarray, "n k"]
-) -> Bool[np.ndarray, "n k"]:
+    distance: Values, angle: Float[ndarray, "n k"], neighbor: Int[ndarray, "n k"]
+) -> Bool[ndarray, "n k"]:
     """Whether the step in range to each neighbour is no larger than slant or noise make it."""
     step = np.abs(distance[neighbor] - distance[:, None])
     noise = NOISE * float(np.median(step[:, 1 : FEWEST + 1]))
@@ -173,23 +178,20 @@ def _on_same_surface(
 
 
 def _fit_patches(
-    terms: Float[np.ndarray, "n k 6"],
-    weight: Float[np.ndarray, "n k"],
-    weighted: Float[np.ndarray, "n k"],
+    terms: Float[ndarray, "n k 6"],
+    weight: Float[ndarray, "n k"],
+    weighted: Float[ndarray, "n k"],
     ridge: tuple[float, ...],
-) -> Float[np.ndarray, "n 6"]:
+) -> Float[ndarray, "n 6"]:
     """Coefficients of each point's patch by least squares; ``weighted`` are the neighbours' values times weights."""
     normal = np.einsum("nki,nk,nkj->nij", terms, weight, terms) + np.diag(ridge)
-    fitted: np.ndarray = np.linalg.solve(normal, np.einsum("nki,nk->ni", terms, weighted)[..., None])[..., 0]
-    return fitted
+    return solve(normal, np.einsum("nki,nk->ni", terms, weighted)[..., None])[..., 0]
 
 
-def _quadratic(
-    places: Points, axis: Points, neighbor: Int[np.ndarray, "n k"], radius: float
-) -> Float[np.ndarray, "n k 6"]:
+def _quadratic(places: Points, axis: Points, neighbor: Int[ndarray, "n k"], radius: float) -> Float[ndarray, "n k 6"]:
     """Terms (1, u, v, u^2, uv, v^2) of each neighbour's place (or direction), u and v across the axis, in radii."""
     across = np.cross(axis, np.eye(3)[np.abs(axis).argmin(axis=1)])
-    across /= np.maximum(np.linalg.norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
+    across /= np.maximum(norm(across, axis=1, keepdims=True), np.finfo(float).tiny)
     apart = (places[neighbor] - places[:, None]) / radius
     u = np.einsum("nkj,nj->nk", apart, across)
     v = np.einsum("nkj,nj->nk", apart, np.cross(axis, across))
@@ -199,18 +201,18 @@ def _quadratic(
 # --- noise of depth images --------------------------------------------------------------------------------------------
 
 
-def second_differences(depth: Float[np.ndarray, "h w"], lag: int) -> Float[np.ndarray, "h w"]:
+def second_differences(depth: PixelValues, lag: int) -> PixelValues:
     """Second differences of inverse depth over so many pixels of each row; NaN where one is not measured.
 
     Along planes inverse depth is linear in the picture, so that they are 0 but for noise.
     """
-    inverse, second = np.full(depth.shape, np.nan), np.full(depth.shape, np.nan)
+    inverse, second = np.full(depth.shape, nan), np.full(depth.shape, nan)
     np.divide(1.0, depth, out=inverse, where=depth > 0)
     second[:, lag:-lag] = inverse[:, : -2 * lag] - 2 * inverse[:, lag:-lag] + inverse[:, 2 * lag :]
     return second
 
 
-def noise_of_differences(*second: Float[np.ndarray, "_ _"]) -> float:
+def noise_of_differences(*second: Float[ndarray, "_ _"]) -> float:
     """Standard deviation of a camera's noise in inverse depth, by second differences of which most are of planes."""
     every = np.concatenate([part[np.isfinite(part)] for part in second])
     return float(median_abs_deviation(every, scale="normal")) / np.sqrt(6.0) if len(every) else 0.0

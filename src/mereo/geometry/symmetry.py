@@ -7,12 +7,17 @@ principal axes: a symmetry keeps both. Lengths are those of the mesh.
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from math import pi
 
 import igl
 import numpy as np
 from jaxtyping import Float, Int
+from numpy import ndarray
+from numpy.linalg import eigh, lstsq, norm
+from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import SegmentedMesh, area_vectors
 from mereo.geometry.solids import Solids, search_tree
 from mereo.geometry.transforms import Matrix, Points, Transform, Vector, longest_side, transform_points
@@ -64,7 +69,7 @@ class Symmetry:
         """Whether each segment comes to lie on itself, so that the pose alone is not determined."""
         return self.lands_on == tuple(range(len(self.lands_on)))
 
-    def describe(self, names: tuple[str, ...]) -> str:
+    def describe(self, names: Names) -> str:
         """Make a sentence of what no camera tells, for segments of these names."""
         how = "by any angle" if self.angle is None else f"by {np.rad2deg(self.angle):.0f} degrees"
         text = f"the object looks the same turned {'in any way' if self.axis is None else how + _about_axis(self.axis)}"
@@ -96,27 +101,27 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
     center, moments, axes = surface.moments()
     alike = np.diff(moments) <= ALIKE_MOMENTS * moments[1:]
     if not alike.any():
-        return _settled(surface, center, np.pi * axes)
+        return _settled(surface, center, pi * axes)
     if alike.all():
-        turns = Rotation.random(600, rng=np.random.default_rng(0)).as_rotvec()
-        halves = [surface.settle(_about(center, np.pi * axis)) for axis in axes]
+        turns = Rotation.random(600, rng=default_rng(0)).as_rotvec()
+        halves = [surface.settle(_about(center, pi * axis)) for axis in axes]
         middle = _fixed_point(halves)
         if np.mean([surface.is_kept(_about(middle, turn)) for turn in turns[:100]]) >= NEARLY:
             whole = _about(middle, turns[0])
             return (Symmetry(whole, None, None, surface.landing(whole)),)
         return _settled(surface, center, turns)
-    main, around = axes[0 if alike[1] else 2], np.arange(1, round(2 * np.pi / STEP)) * STEP
-    half = surface.settle(_about(center, np.pi * main))
+    main, around = axes[0 if alike[1] else 2], np.arange(1, round(2 * pi / STEP)) * STEP
+    half = surface.settle(_about(center, pi * main))
     axis, middle = _axis_of(half), _fixed_point([half])
     if np.mean([surface.is_kept(_about(middle, angle * axis)) for angle in around]) >= NEARLY:
         whole = _about(middle, axis)  # by 1 rad, which nothing but a round part inside survives
-        return (Symmetry(whole, None, axis, surface.landing(whole)), *_settled(surface, middle, np.pi * axes[1:2]))
-    between = np.arange(round(np.pi / STEP))[:, None] * STEP
+        return (Symmetry(whole, None, axis, surface.landing(whole)), *_settled(surface, middle, pi * axes[1:2]))
+    between = np.arange(round(pi / STEP))[:, None] * STEP
     across = np.cos(between) * axes[1] + np.sin(between) * np.cross(main, axes[1])
-    return _settled(surface, center, np.concatenate([around[:, None] * main, np.pi * across]))
+    return _settled(surface, center, np.concatenate([around[:, None] * main, pi * across]))
 
 
-def describe_symmetries(symmetries: Sequence[Symmetry], names: tuple[str, ...], of_segments: bool = False) -> list[str]:
+def describe_symmetries(symmetries: Sequence[Symmetry], names: Names, of_segments: bool = False) -> list[str]:
     """Make one sentence for each thing that no camera tells: of symmetries with the same effect the first.
 
     With ``of_segments`` those are left out that turn each segment onto itself.
@@ -141,14 +146,14 @@ class _Surface:
     tolerance: float
     points: Points
     normals: Points
-    visible: Int[np.ndarray, " v"]
+    visible: Int[ndarray, " v"]
 
     @classmethod
     def of(cls, mesh: SegmentedMesh, tolerance: float) -> "_Surface":
         vertices, faces, _ = mesh.merged()
         normals = area_vectors(vertices, faces)
-        area = np.linalg.norm(normals, axis=1)
-        rng, total = np.random.default_rng(0), np.cumsum(area)
+        area = norm(normals, axis=1)
+        rng, total = default_rng(0), np.cumsum(area)
         face = np.searchsorted(total, (np.arange(SAMPLES) + rng.random(SAMPLES)) * total[-1] / SAMPLES)
         face = np.minimum(face, len(faces) - 1)
         share = rng.dirichlet((1.0, 1.0, 1.0), SAMPLES)
@@ -159,11 +164,11 @@ class _Surface:
         return cls(mesh, tolerance, points, normals, np.flatnonzero(outside))
 
     @cached_property
-    def _tree(self) -> tuple[igl.AABB, np.ndarray, np.ndarray]:
+    def _tree(self) -> tuple[igl.AABB, ndarray, ndarray]:
         vertices, faces, _ = self.mesh.merged()
         return search_tree(vertices, faces), vertices, faces
 
-    def nearest(self, points: Float[np.ndarray, "p 3"]) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, "p 3"]]:
+    def nearest(self, points: Float[ndarray, "p 3"]) -> tuple[Float[ndarray, " p"], Float[ndarray, "p 3"]]:
         """Distance and place of the nearest point of all surfaces."""
         tree, vertices, faces = self._tree
         squared, _, place = tree.squared_distance(vertices, faces, np.ascontiguousarray(points))
@@ -173,7 +178,7 @@ class _Surface:
         """Centroid of the visible surface, its second moments, ascending, and their axes as rows."""
         seen = self.points[self.visible]
         center = seen.mean(axis=0)
-        values, vectors = np.linalg.eigh((seen - center).T @ (seen - center))
+        values, vectors = eigh((seen - center).T @ (seen - center))
         return center, values, vectors.T
 
     def off(self, turn: Transform) -> float:
@@ -181,9 +186,8 @@ class _Surface:
         return float(np.sqrt((self.nearest(transform_points(turn, self._few))[0] ** 2).mean()))
 
     @property
-    def _few(self) -> Float[np.ndarray, "f 3"]:
-        few: np.ndarray = self.points[self.visible[:: max(1, len(self.visible) // FEW)]]
-        return few
+    def _few(self) -> Float[ndarray, "f 3"]:
+        return self.points[self.visible[:: max(1, len(self.visible) // FEW)]]
 
     def is_kept(self, turn: Transform) -> bool:
         """Whether the turned visible surface lies on the surface."""
@@ -200,7 +204,7 @@ class _Surface:
             center = moved.mean(axis=0)
             rows = np.hstack([np.cross(moved - center, turned), turned])
             rows = np.vstack([rows, 1e-3 * np.sqrt(len(rows)) * np.eye(6)])
-            change = np.linalg.lstsq(rows, np.append((offset * turned).sum(axis=1), np.zeros(6)), rcond=None)[0]
+            change = lstsq(rows, np.append((offset * turned).sum(axis=1), np.zeros(6)), rcond=None)[0]
             turn = _about(center, change[:3], change[3:]) @ turn
         return turn
 
@@ -215,7 +219,7 @@ class _Surface:
         return tuple(result) if len(set(result)) == len(result) or None in result else (None,) * len(result)
 
 
-def _settled(surface: _Surface, center: Vector, turns: Float[np.ndarray, "t 3"]) -> tuple[Symmetry, ...]:
+def _settled(surface: _Surface, center: Vector, turns: Float[ndarray, "t 3"]) -> tuple[Symmetry, ...]:
     """Symmetries near to turns about a centre, each once."""
     starts = [_about(center, turn) for turn in turns]
     order = np.argsort([surface.off(start) for start in starts], kind="stable")[:60]
@@ -240,14 +244,13 @@ def _about(center: Vector, turn: Vector, shift: Vector | float = 0.0) -> Transfo
 def _axis_of(turn: Transform) -> Vector:
     """Axis of a turn, a unit vector."""
     vector = Rotation.from_matrix(turn[:3, :3]).as_rotvec()
-    return vector / max(float(np.linalg.norm(vector)), 1e-12)
+    return vector / max(float(norm(vector)), 1e-12)
 
 
 def _fixed_point(turns: list[Transform]) -> Vector:
     """Find the point that turns move least; of those of one axis the nearest to the origin."""
     rows = np.concatenate([np.eye(3) - turn[:3, :3] for turn in turns])
-    point: np.ndarray = np.linalg.lstsq(rows, np.concatenate([turn[:3, 3] for turn in turns]), rcond=1e-6)[0]
-    return point
+    return lstsq(rows, np.concatenate([turn[:3, 3] for turn in turns]), rcond=1e-6)[0]
 
 
 def _angle(rotation: Matrix) -> float:

@@ -5,40 +5,45 @@ from numbers import Real
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
+from numpy.linalg import det, norm, svd
 from numpy.typing import ArrayLike
 
 from mereo.geometry.conventions import LARGEST
 
-PointArray = Float[np.ndarray, "*n 3"]
+PointArray = Float[ndarray, "*n 3"]
 """Points in an array of any shape."""
 
-Points = Float[np.ndarray, "n 3"]
+Points = Float[ndarray, "n 3"]
 """Positions or vectors in rows: as many as whatever else has the axis ``n`` in a signature."""
 
-AnyPoints = Float[np.ndarray, "_ 3"]
+AnyPoints = Float[ndarray, "_ 3"]
 """The same, as many as there are: no other array of the signature has to have as many rows."""
 
-Rows = Float[np.ndarray, "n c"]
+Rows = Float[ndarray, "n c"]
 """Numbers in rows, one for each point: its position and what else is known of it, or what a network says of it."""
 
-Values = Float[np.ndarray, " n"]
+Values = Float[ndarray, " n"]
 """A number for each row of the axis ``n``; ``Indices``, ``Labels`` (of segments) and ``Flags`` likewise."""
 
-Indices = Int[np.ndarray, " n"]
-Labels = UInt8[np.ndarray, " n"]
-Flags = Bool[np.ndarray, " n"]
+Indices = Int[ndarray, " n"]
+Labels = UInt8[ndarray, " n"]
+Flags = Bool[ndarray, " n"]
 
-Vector = Float[np.ndarray, "3"]
+Subset = Int[ndarray, " m"]
+"""Indices of some of the rows, which are as many as whatever else has the axis ``m``."""
 
-Matrix = Float[np.ndarray, "3 3"]
+Vector = Float[ndarray, "3"]
+
+Matrix = Float[ndarray, "3 3"]
 """Linear map of space, such as a rotation; ``Matrices`` are one for each row of the axis ``n``."""
 
-Matrices = Float[np.ndarray, "n 3 3"]
+Matrices = Float[ndarray, "n 3 3"]
 
-Transform = Float[np.ndarray, "4 4"]
+Transform = Float[ndarray, "4 4"]
 """Homogeneous matrix of a map between two frames."""
 
-Corners = Float[np.ndarray, "2 3"]
+Corners = Float[ndarray, "2 3"]
 """Lower and upper corner of a box along the axes."""
 
 
@@ -60,18 +65,18 @@ def is_rigid(transform: Transform, tolerance: float = 1e-6) -> bool:
     if transform.shape != (4, 4) or not np.isfinite(transform).all():
         return False
     rotation = transform[:3, :3]
-    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=tolerance) and np.linalg.det(rotation) > 0
+    is_rotation = np.allclose(rotation @ rotation.T, np.eye(3), atol=tolerance) and det(rotation) > 0
     return bool(is_rotation and transform[3].tolist() == [0, 0, 0, 1])
 
 
 def checked_pose(pose: ArrayLike) -> Transform:
     """A rigid pose as numbers, of a few printed digits or more; ``ValueError`` for what is none."""
-    entries: np.ndarray = np.asarray(pose, dtype=object)  # of which rows may differ in length
+    entries = np.asarray(pose, object)  # of which rows may differ in length
     what = f"of the shape {entries.shape}"
     if entries.shape == (4, 4):
         what = "not of real numbers"
         if all(isinstance(entry, Real) for entry in entries.flat):
-            T: np.ndarray = entries.astype(np.float64)
+            T = entries.astype(float)
             if is_rigid(T, 1e-3) and np.abs(T).max() <= LARGEST:
                 return T
             what = str(np.round(T, 3).tolist())
@@ -88,24 +93,29 @@ def transform_points(transform: Transform, points: PointArray) -> PointArray:
 
 def rotation_along(axis: Vector) -> Matrix:
     """Rotation whose third column is along ``axis``."""
-    z = axis / np.linalg.norm(axis)
+    z = axis / norm(axis)
     helper = np.eye(3)[np.argmin(np.abs(z))]
     x = np.cross(helper, z)
-    x /= np.linalg.norm(x)
+    x /= norm(x)
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
 def look_at(eye: Vector, target: Vector, up: Vector, roll_rad: float = 0.0) -> Transform:
     """Pose ``T_world_camera`` at ``eye``, optical axis through ``target``, image up along ``up`` before the roll."""
     z = target - eye
-    z = z / np.linalg.norm(z)
+    z = z / norm(z)
     x = np.cross(z, up)
-    if np.linalg.norm(x) < 1e-6 * np.linalg.norm(up):  # looking along `up`: any horizon is as good
+    if norm(x) < 1e-6 * norm(up):  # looking along `up`: any horizon is as good
         x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
-    x = x / np.linalg.norm(x)
+    x = x / norm(x)
     y = np.cross(z, x)
     cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
+
+
+def box_of(points: AnyPoints) -> Corners:
+    """Box around points, parallel to the axes."""
+    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def longest_side(points: AnyPoints) -> float:
@@ -113,21 +123,21 @@ def longest_side(points: AnyPoints) -> float:
     return float(np.ptp(points, axis=0).max())
 
 
-def unit_rows(vectors: Float[np.ndarray, "*n k"]) -> Float[np.ndarray, "*n k"]:
+def unit_rows(vectors: Float[ndarray, "*n k"]) -> Float[ndarray, "*n k"]:
     """Vectors of length 1 along each row; rows of zeros stay so."""
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-30)
+    return vectors / np.maximum(norm(vectors, axis=-1, keepdims=True), 1e-30)
 
 
 def finite_svd(
-    matrix: Float[np.ndarray, "*b m n"],
-) -> tuple[Float[np.ndarray, "*b m m"], Float[np.ndarray, "*b k"], Float[np.ndarray, "*b n n"]]:
+    matrix: Float[ndarray, "*b m n"],
+) -> tuple[Float[ndarray, "*b m m"], Float[ndarray, "*b k"], Float[ndarray, "*b n n"]]:
     """Singular value decomposition ``U, S, V^T`` of numpy, which for some matrices with an infinity never returns.
 
     Raises ``ValueError`` for a matrix that is not finite.
     """
     if not np.isfinite(matrix).all():
         raise ValueError("points are infinite or so far apart that their products are; scale them to another unit")
-    u, s, v = np.linalg.svd(matrix)
+    u, s, v = svd(matrix)
     return u, s, v
 
 
@@ -140,7 +150,7 @@ def fit_rigid(source: Points, target: Points, weights: Values | None = None) -> 
     middle, aim = (np.average(points, axis=0, weights=weights) for points in (source, target))
     offsets = target - aim if weights is None else weights[:, None] * (target - aim)
     u, _, v = finite_svd(offsets.T @ (source - middle))
-    rotation = (u * [1.0, 1.0, np.sign(np.linalg.det(u @ v))]) @ v
+    rotation = (u * [1.0, 1.0, np.sign(det(u @ v))]) @ v
     return rigid(rotation, aim - rotation @ middle)
 
 
@@ -167,7 +177,7 @@ class Normalizer:
         """Normalizer of a cloud, the paper's t and s. Raises ``ValueError`` when the cloud has no extent."""
         if len(points) == 0:
             raise ValueError("the point cloud is empty; it needs points on the object: check the mask and the units")
-        low, high = points.min(axis=0), points.max(axis=0)
+        low, high = box_of(points)
         half = float((high - low).max()) / 2
         if not half > 0:
             raise ValueError("all points coincide; the cloud needs an extent: check the file's columns and units")
@@ -197,10 +207,10 @@ class Normalizer:
 # --- best rotations ---------------------------------------------------------------------------------------------------
 
 
-def best_rotations(covariance: Float[np.ndarray, "*s 3 3"]) -> Float[np.ndarray, "*s 3 3"]:
+def best_rotations(covariance: Float[ndarray, "*s 3 3"]) -> Float[ndarray, "*s 3 3"]:
     """Rotations R that maximize ``trace(R H)`` for ``H = sum_i x_i y_i^T``, centred: they bring x onto y (Kabsch)."""
     left, _, right = finite_svd(covariance)
-    proper = np.sign(np.linalg.det(left) * np.linalg.det(right))
+    proper = np.sign(det(left) * det(right))
     left[..., 2] *= np.where(proper == 0, 1.0, proper)[..., None]
     return np.swapaxes(left @ right, -1, -2)
 
@@ -214,15 +224,15 @@ def robust_rigid(
     """``fit_rigid`` under a Cauchy loss whose scale falls from the residuals' own median to ``sigma``."""
     T = fit_rigid(source, target, weight)
     for _ in range(20):  # it has converged by then
-        distance = np.linalg.norm(transform_points(T, source) - target, axis=1)
+        distance = norm(transform_points(T, source) - target, axis=1)
         scale = max(float(np.median(distance)), sigma)
         T = fit_rigid(source, target, weight / (1.0 + (distance / scale) ** 2))
     return T
 
 
 def align_all(
-    shapes: Float[np.ndarray, "s n 3"], rounds: int, tolerance: float
-) -> tuple[Float[np.ndarray, "s 3 3"], Float[np.ndarray, "s 3"], Points]:
+    shapes: Float[ndarray, "s n 3"], rounds: int, tolerance: float
+) -> tuple[Float[ndarray, "s 3 3"], Float[ndarray, "s 3"], Points]:
     """Rotations and centres that bring shapes to their mean: generalized Procrustes alignment without scale (Gower).
 
     ``(shapes - center) @ R.T`` are the aligned shapes. It must converge (the mean moves by less than ``tolerance``):
@@ -233,7 +243,7 @@ def align_all(
     mean, rotation = centred[0], np.broadcast_to(np.eye(3), (len(shapes), 3, 3))
     for _ in range(rounds):
         covariance = np.matmul(centred.transpose(0, 2, 1), mean)
-        rotation = best_rotations(covariance.astype(np.float64)).astype(shapes.dtype)
+        rotation = best_rotations(covariance.astype(float)).astype(shapes.dtype)
         moved = np.matmul(centred, rotation.transpose(0, 2, 1)).mean(axis=0)
         change = np.abs(moved - mean).max()
         mean = moved

@@ -79,7 +79,7 @@ class PoseTable:
     """
 
     header: Names
-    rows: tuple[tuple[str, ...], ...]
+    rows: tuple[Names, ...]
     delimiter: str
     points: Points
     rotations: Matrices | None
@@ -94,7 +94,7 @@ class PoseTable:
         changed = dict(zip(POSITION, (factor * self.points).T, strict=True))
         if self.rotations is not None:
             changed |= dict(zip(QUATERNION, Rotation.from_matrix(self.rotations).as_quat().T, strict=True))
-        cells = np.array(self.rows, dtype=object).reshape(-1, len(self.header))
+        cells = np.array(self.rows, object).reshape(-1, len(self.header))
         for name, values in changed.items():
             cells[:, columns[name]] = [f"{value:.10g}" for value in values]
         file = io.StringIO()

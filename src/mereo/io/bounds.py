@@ -5,7 +5,6 @@ Light, so that the command line may import it.
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields
 from functools import lru_cache, partial
 from numbers import Integral, Real
@@ -14,7 +13,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from tyro.conf import arg
 
-from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.conventions import MIN_POINTS, Facts, WholeNumbers
 
 
 @dataclass(frozen=True)
@@ -60,7 +59,7 @@ Workers = Annotated[int, *_within(0, 1024)]
 Points = Annotated[int, *_within(MIN_POINTS, 2**20)]
 ImageSize = Annotated[int, *_within(8, 8192)]
 Width = Annotated[int, *_within(1, 8192)]
-Widths = Annotated[tuple[int, ...], *_within(1, 8192)]
+Widths = Annotated[WholeNumbers, *_within(1, 8192)]
 Neighbors = Annotated[int, *_within(1, 1024)]
 NeighborsOrNone = Annotated[int, *_within(0, 1024)]
 Batch = Annotated[int, *_within(1, 65536)]
@@ -86,6 +85,10 @@ ShareRange = Annotated[tuple[float, float], *_within(0, 1, above=True)]
 Instances = Annotated[int | Literal["all"], *_within(1)]  # of an object in a whole frame
 
 
+GROUP = arg(name="")
+"""Of settings whose options are called as their fields, without a prefix."""
+
+
 _kinds = lru_cache(maxsize=64)(partial(get_type_hints, include_extras=True))
 
 
@@ -97,7 +100,7 @@ def check_bounds(settings: Any, prefix: str = "") -> None:
     check_values(type(settings), {item.name: getattr(settings, item.name) for item in fields(settings)}, prefix)
 
 
-def check_values(settings: type, values: Mapping[str, Any], prefix: str = "") -> None:
+def check_values(settings: type, values: Facts, prefix: str = "") -> None:
     """Raise ``ValueError`` as ``check_bounds`` does, for values by field of which a dataclass is yet to be made."""
     kinds = _kinds(settings)
     for item in fields(settings):

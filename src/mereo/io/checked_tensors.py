@@ -7,22 +7,23 @@ Files of earlier versions have none and are taken as they are.
 import hashlib
 import json
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
+from numpy import ndarray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from mereo.geometry.conventions import Facts
 from mereo.io.atomic_files import JsonObject
 from mereo.io.errors import reason
 from mereo.io.object_storage import Place, StorageError
 
 HEADER, CHECKSUM = "mereo", "sha256"
 
-Tensors = Mapping[str, np.ndarray]
+Tensors = Mapping[str, ndarray]
 
 
-def pack_tensors(tensors: Tensors, facts: Mapping[str, Any]) -> bytes:
+def pack_tensors(tensors: Tensors, facts: Facts) -> bytes:
     """Content of a file with these tensors, and facts that JSON knows."""
     whole = {name: np.ascontiguousarray(value) for name, value in tensors.items()}
     return save(whole, metadata={HEADER: json.dumps({**facts, CHECKSUM: _digest(whole, facts)})})
@@ -40,7 +41,7 @@ def read_content(path: Place) -> bytes:
         raise ValueError(reason(error)) from None
 
 
-def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, np.ndarray], JsonObject]:
+def unpack_tensors(content: bytes, dataset: str | None = None) -> tuple[dict[str, ndarray], JsonObject]:
     """Tensors that ``pack_tensors`` has packed, and their facts, none where there is no header entry.
 
     Raises ``ValueError`` (its reason only) where the content is damaged, or of another dataset than the one of this
@@ -83,7 +84,7 @@ def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[st
             raise ValueError(f"its tensor {name!r} has the shape {list(shape)}")
 
 
-def _digest(tensors: Tensors, facts: Mapping[str, Any]) -> str:
+def _digest(tensors: Tensors, facts: Facts) -> str:
     digest = hashlib.sha256(json.dumps(facts, sort_keys=True).encode())
     for name, value in sorted(tensors.items()):
         digest.update(f"{name} {value.dtype.str} {value.shape}".encode())

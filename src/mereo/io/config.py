@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mereo.geometry.conventions import CloudAxes, LengthUnit, Way
+from mereo.geometry.conventions import CloudAxes, LengthUnit, Way, WholeNumbers
 from mereo.io.bounds import IndexOrNone, PositiveOrUnknown, check_bounds, check_value
 
 CONFIG = "config.json"
@@ -104,7 +104,7 @@ class InputConfig:
     topic: str | None = None
     frame_index: IndexOrNone = None
     depth_along: DepthAlong = "z"
-    mask_value: tuple[int, ...] = ()
+    mask_value: WholeNumbers = ()
     camera_pose: Path | None = None
     viewpoint: Viewpoint = "auto"
 

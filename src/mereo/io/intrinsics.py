@@ -99,7 +99,7 @@ def stated_fields(source: Any) -> Fields:
     if _states_a_camera(stated):
         return stated
     try:
-        numbers = np.asarray(source, dtype=np.float64)
+        numbers = np.asarray(source, float)
         return {"K": numbers.tolist()} if numbers.shape == (3, 3) else _fields_of_numbers(numbers.ravel().tolist())
     except (TypeError, ValueError):
         text = " ".join(repr(source).split())
@@ -262,7 +262,7 @@ def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
     if key is None:
         raise ValueError("it has neither fx, fy, cx, cy nor intrinsic_matrix, K, cam_K or camera_matrix")
     values = fields[key]
-    matrix = np.asarray(values["data"] if isinstance(values, dict) else values, dtype=np.float64)
+    matrix = np.asarray(values["data"] if isinstance(values, dict) else values, float)
     if matrix.size != 9:
         raise ValueError(f"its matrix has {matrix.size} numbers instead of 9")
     matrix = matrix.reshape(3, 3)
@@ -320,7 +320,7 @@ def _coefficients(fields: Fields) -> tuple[Values, str]:
         values = fields.get(key)
         values = values.get("data") if isinstance(values, dict) else values
         if values is not None and not isinstance(values, str) and np.size(values):
-            return np.asarray(values, dtype=np.float64).reshape(-1), model
+            return np.asarray(values, float).reshape(-1), model
     names = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
     return np.array([float(fields.get(name, 0.0)) for name in names]), model
 

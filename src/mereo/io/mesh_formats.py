@@ -21,13 +21,16 @@ from zipfile import ZipFile
 import numpy as np
 import trimesh
 from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
 from numpy.linalg import det
 
 from mereo.geometry.conventions import LARGEST
 from mereo.geometry.mesh import (
     PALETTE,
     AnyFaces,
+    ChangedMesh,
     Color,
+    Colors,
     Faces,
     Segment,
     SegmentedMesh,
@@ -176,8 +179,8 @@ Owners = list[tuple[str, str, str]]
 
 def _obj_parts(path: Path) -> list[Part]:
     """Parts of an OBJ file, parsed here because trimesh gives them in no stable order. Polygons become fans."""
-    positions: list[list[float]] = []
-    faces: list[list[int]] = []
+    positions = list[list[float]]()
+    faces = list[list[int]]()
     owners: Owners = []
     name = {"o": "", "g": "", "usemtl": "", "mtllib": ""}
     for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
@@ -193,7 +196,7 @@ def _obj_parts(path: Path) -> list[Part]:
             faces += [[corners[0], corners[i], corners[i + 1]] for i in range(1, len(corners) - 1)]
             owners += [(name["o"], name["g"], name["usemtl"])] * (len(corners) - 2)
     colors = _material_colors(path, name["mtllib"])
-    vertices, triangles = np.asarray(positions), np.asarray(faces, dtype=np.int64)
+    vertices, triangles = np.asarray(positions), np.asarray(faces, np.int64)
     if materials := _material_parts(vertices, triangles, owners, path):
         owners = materials
     return _split_parts(vertices, triangles, owners, colors, path.stem)
@@ -302,7 +305,7 @@ def _scene_parts(path: Path) -> list[Part]:
 def _load_scene(path: Path) -> Any:
     """trimesh's scene of a file; no other file is opened but the buffers of glTF."""
     if path.suffix.lower() not in (".glb", ".gltf"):
-        strict: dict[str, Any] = {"ignore_broken": False} if path.suffix.lower() == ".dae" else {}
+        strict: JsonObject = {"ignore_broken": False} if path.suffix.lower() == ".dae" else {}
         return trimesh.load_scene(path, resolver={}, process=False, **strict)
     tree, buffers = _plain_gltf(path)
     return trimesh.load_scene(BytesIO(json.dumps(tree).encode()), "gltf", buffers, process=False)
@@ -347,8 +350,8 @@ def _in_frame(scene: Any, node: str, base: str) -> tuple[Vertices, Faces, Any]:
     """Vertices of a node in the frame of another one, its faces, and trimesh's geometry."""
     transform, key = scene.graph.get(node, frame_from=base)
     geometry = scene.geometry[key]
-    vertices = transform_points(transform, np.asarray(geometry.vertices, dtype=np.float64))
-    faces = np.asarray(geometry.faces, dtype=np.int64)
+    vertices = transform_points(transform, np.asarray(geometry.vertices, float))
+    faces = np.asarray(geometry.faces, np.int64)
     if det(transform[:3, :3]) < 0:
         faces = faces[:, ::-1]
     return vertices, faces, geometry
@@ -365,7 +368,7 @@ def _color(geometry: Any) -> Color | None:
     return red, green, blue
 
 
-def merge_positions(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray, "w 3"], Int[np.ndarray, "g 3"]]:
+def merge_positions(vertices: Vertices, faces: Faces) -> ChangedMesh:
     """Merge vertices at exactly the same position, in order of first use, and drop the faces this collapses."""
     first, index = _distinct(vertices)
     if len(first) == len(vertices):
@@ -374,10 +377,10 @@ def merge_positions(vertices: Vertices, faces: Faces) -> tuple[Float[np.ndarray,
     return vertices[first], merged[three_cornered(merged)]
 
 
-def _distinct(rows: Float[np.ndarray, "v k"]) -> tuple[Int[np.ndarray, " w"], Int[np.ndarray, " v"]]:
+def _distinct(rows: Float[ndarray, "v k"]) -> tuple[Int[ndarray, " w"], Int[ndarray, " v"]]:
     """First of each group of equal rows, in their order, and which of these each row is."""
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    rank = np.empty(len(first), dtype=np.int64)
+    rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
     return np.sort(first), rank[inverse.reshape(-1)]
 
@@ -441,7 +444,7 @@ def _buffer(path: Path, uri: str | None, chunk: bytes) -> bytes:
     return b64decode(uri.partition(",")[2]) if uri.startswith("data:") else _neighbour(path, unquote(uri)).read_bytes()
 
 
-def _values(tree: JsonObject, buffers: Buffers, accessor: JsonObject) -> Float[np.ndarray, "n k"]:
+def _values(tree: JsonObject, buffers: Buffers, accessor: JsonObject) -> Float[ndarray, "n k"]:
     """Values of an accessor (glTF 2.0, sections 3.6.2 and 5.1)."""
     kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
     shape = accessor["count"], width
@@ -450,7 +453,7 @@ def _values(tree: JsonObject, buffers: Buffers, accessor: JsonObject) -> Float[n
         view = tree["bufferViews"][accessor["bufferView"]]
         start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
         strides = view.get("byteStride", width * kind.itemsize), kind.itemsize
-        values = np.ndarray(shape, kind, buffers[str(view["buffer"])], start, strides).astype(np.float64)
+        values = ndarray(shape, kind, buffers[str(view["buffer"])], start, strides).astype(float)
     if sparse := accessor.get("sparse"):
         count = {"count": sparse["count"]}
         rows = _values(tree, buffers, {"type": "SCALAR"} | sparse["indices"] | count)[:, 0].astype(np.int64)
@@ -514,7 +517,7 @@ class GlbScene:
     """
 
     mesh: SegmentedMesh
-    colors: tuple[UInt8[np.ndarray, "_ 3"] | None, ...]
+    colors: tuple[UInt8[ndarray, "_ 3"] | None, ...]
     radii: Radii | None
     rotation: Matrix
     unit_m: float
@@ -533,7 +536,7 @@ def read_glb(path: AnyPath) -> GlbScene:
         scene = _load_scene(path)
         is_ours = VIEWER_ROOT in scene.graph.nodes
         base = VIEWER_ROOT if is_ours else scene.graph.base_frame
-        root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_ours else np.eye(4), dtype=np.float64)[:3, :3]
+        root = np.asarray(scene.graph.get(VIEWER_ROOT)[0] if is_ours else np.eye(4), float)[:3, :3]
         nodes = _nodes_with_faces(scene)
         if not nodes:
             raise ValueError("it has no faces")
@@ -549,7 +552,7 @@ def read_glb(path: AnyPath) -> GlbScene:
 
 def _glb_part(
     scene: Any, node: str, base: str, number: int, stem: str
-) -> tuple[Segment, UInt8[np.ndarray, "v 3"] | None, Float[np.ndarray, " v"] | None, bool]:
+) -> tuple[Segment, UInt8[ndarray, "v 3"] | None, Float[ndarray, " v"] | None, bool]:
     """Segment of a node with faces, colours of its vertices, their radii, and whether these are calibrated."""
     vertices, faces, geometry = _in_frame(scene, node, base)
     _check_places(node, vertices)
@@ -561,17 +564,17 @@ def _glb_part(
     return (
         Segment(name, color, vertices[kept], index[faces], solid=False),
         None if colors is None else colors[kept],
-        None if radii is None else np.asarray(radii, dtype=np.float64).reshape(-1)[kept],
+        None if radii is None else np.asarray(radii, float).reshape(-1)[kept],
         isinstance(facts, dict) and facts.get("calibrated") is True,
     )
 
 
-def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[np.ndarray, "v 3"] | None]:
+def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[ndarray, "v 3"] | None]:
     """One colour of a mesh, and those of its vertices where they have several; as a screen shows them."""
     visual, count = geometry.visual, len(geometry.vertices)
     material = getattr(visual, "material", None)
     factor = getattr(material, "baseColorFactor", None)
-    tint = np.ones(3) if factor is None else np.asarray(factor, dtype=np.float64)[:3] / 255.0
+    tint = np.ones(3) if factor is None else np.asarray(factor, float)[:3] / 255.0
     each = None
     painted = getattr(visual, "vertex_attributes", {}).get("color")
     painted = visual.vertex_colors if painted is None and visual.kind == "vertex" else painted
@@ -589,7 +592,7 @@ def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[np.ndarray, "v 3"
     return (int(color[0]), int(color[1]), int(color[2])), each if varied else None
 
 
-def _screen(linear: Points) -> UInt8[np.ndarray, "n 3"]:
+def _screen(linear: Points) -> Colors:
     """Colours of a screen from linear light (glTF 2.0, section 3.9.2)."""
     light = np.clip(linear, 0.0, 1.0)
     share = np.where(light <= 0.0031308, light * 12.92, 1.055 * light ** (1 / 2.4) - 0.055)
@@ -598,16 +601,14 @@ def _screen(linear: Points) -> UInt8[np.ndarray, "n 3"]:
 
 def _numbered(given: Sequence[str]) -> list[str]:
     """Names of which no two are the same: repeated ones are numbered."""
-    names: list[str] = []
+    names = list[str]()
     for name in given:
         tries = (name if n == 1 else f"{name} ({n})" for n in range(1, len(given) + 1))
         names.append(next(name for name in tries if name not in names))
     return names
 
 
-def _radii(
-    segments: Sequence[Segment], radii: Sequence[Float[np.ndarray, " _"] | None], calibrated: bool
-) -> Radii | None:
+def _radii(segments: Sequence[Segment], radii: Sequence[Float[ndarray, " _"] | None], calibrated: bool) -> Radii | None:
     values = [each for each in radii if each is not None and np.isfinite(each).all()]
     if len(values) < len(segments):
         return None

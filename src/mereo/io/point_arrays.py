@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Num
+from numpy import ndarray
 from numpy.linalg import norm
 from PIL import Image
 
@@ -71,7 +72,7 @@ def _with_normals(points: Points, source: Any) -> Rows:
     """Points, with the normals that an object of Open3D or trimesh has for each of them, if it has."""
     for name in ("normals", "vertex_normals"):
         with suppress(Exception):  # of what else has such a name
-            normals = np.asarray(getattr(source, name), dtype=np.float64)
+            normals = np.asarray(getattr(source, name), float)
             if normals.shape == points.shape and np.isfinite(normals).all():
                 return np.hstack([points, normals])
     return points
@@ -124,7 +125,7 @@ def _positions(source: Any) -> tuple[Points, Points | None, str, bool]:
         raise ValueError(f"{kind} holds {counted(len(source), 'frame')}; one is needed: give its elements one by one")
     if _is_cloud_message(source):
         return _decoded(cloud_points, source, "PointCloud2"), None, "the PointCloud2 message", source.height > 1
-    if not isinstance(source, np.ndarray | list | tuple):
+    if not isinstance(source, ndarray | list | tuple):
         if hasattr(source, "columns"):
             raise ValueError(
                 f"{kind} is a table, whose columns may come in any order; x, y and z are needed in this one: give "
@@ -169,7 +170,7 @@ def _normals(columns: Points, name: str) -> Points | None:
     )
 
 
-def _decoded(decode: Callable[[Any], np.ndarray], message: Any, kind: str) -> np.ndarray:
+def _decoded(decode: Callable[[Any], ndarray], message: Any, kind: str) -> ndarray:
     try:
         return decode(message)
     except Exception as error:  # whatever a broken message makes of the parser
@@ -194,7 +195,7 @@ def _carried(source: Any) -> Any:
     return next((values for values in attributes if values is not None and not callable(values)), None)
 
 
-def _structured_points(records: np.ndarray, name: str) -> Points:
+def _structured_points(records: ndarray, name: str) -> Points:
     fields = records.dtype.names or ()
     if not {"x", "y", "z"} <= set(fields):
         raise ValueError(f"{name} has the fields {listed(fields)}; x, y and z are needed: rename the fields")
@@ -237,7 +238,7 @@ def mask_image(mask: Any) -> Image.Image:
     return Image.fromarray(values > 0 if low < 0 else values >= 0.5)
 
 
-def depth_values(source: Any) -> Num[np.ndarray, "h w"]:
+def depth_values(source: Any) -> Num[ndarray, "h w"]:
     """Stored values of a depth image in memory, as they are.
 
     Args:
@@ -274,7 +275,7 @@ def mesh_of(source: Any) -> SegmentedMesh | None:
     """
     if isinstance(source, SegmentedMesh):
         return source
-    named: Any = parts_of_scene(source)
+    named = parts_of_scene(source)
     if not (is_named := isinstance(named, Mapping)):
         is_list = isinstance(source, list | tuple) and _triangles(source) is None
         named = dict(enumerate(source if is_list else [source]))
@@ -317,7 +318,7 @@ def _triangles(source: Any) -> tuple[Vertices, Faces] | None:
             f"the mesh has vertices of shape {points.shape} and faces of {corners.shape}; they must be "
             "v x 3 numbers and f x 3 whole ones: split its faces into triangles"
         )
-    return points.astype(np.float64), corners.astype(np.int64)
+    return points.astype(float), corners.astype(np.int64)
 
 
 # --- arrays of other libraries ----------------------------------------------------------------------------------------
@@ -325,7 +326,7 @@ def _triangles(source: Any) -> tuple[Vertices, Faces] | None:
 
 def _array(
     source: Any, kind: str, cure: str = "n x 3 numbers are needed: make it a numpy array of rows of x, y and z"
-) -> np.ndarray:
+) -> ndarray:
     if isinstance(source, np.ma.MaskedArray):
         return source
     try:
@@ -340,11 +341,11 @@ def _array(
         raise ValueError(f"{kind} is no array ({why}); {cure}") from error
 
 
-def _floats(values: np.ndarray) -> Float[np.ndarray, "..."]:
-    return np.asarray(np.ma.filled(values.astype(np.float64), np.nan))
+def _floats(values: ndarray) -> Float[ndarray, "..."]:
+    return np.asarray(np.ma.filled(values.astype(float), np.nan))
 
 
-def _what_else(values: np.ndarray) -> str:
+def _what_else(values: ndarray) -> str:
     """What numbers are instead of points, and what to do: the end of a sentence about them; empty for points."""
     if values.ndim in (2, 3):
         flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]

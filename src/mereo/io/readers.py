@@ -15,21 +15,19 @@ from typing import Any
 
 import numpy as np
 import trimesh
-from jaxtyping import Bool, Float, Real
+from jaxtyping import Float, Real
+from numpy import ndarray
 from numpy.linalg import norm
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from mereo.geometry.brief import listed
-from mereo.geometry.camera import Camera, DepthImage, PointCloud, Size
-from mereo.geometry.conventions import LARGEST
+from mereo.geometry.camera import Camera, DepthImage, PixelMask, PixelValues, PointCloud, Size
+from mereo.geometry.conventions import LARGEST, Names, WholeNumbers
 from mereo.geometry.mesh import with_normals
 from mereo.geometry.transforms import Points, Rows, Transform, checked_pose, rigid
 from mereo.io.errors import AnyPath, check_count, check_suffix, limited_memory, quiet, readable, without_output
 from mereo.io.extras import library
-
-Mask = Bool[np.ndarray, "h w"]
-"""Pixels that show the object."""
 
 PLAUSIBLE_DEPTH_M = (0.05, 20.0)
 """Range of an image's median depth; beyond it the unit is wrong, which is otherwise invisible."""
@@ -53,7 +51,7 @@ class InputWarning(UserWarning):
     """Warning that a file may be meant in two ways, and in which it was taken."""
 
 
-Raw = Real[np.ndarray, "h w"]
+Raw = Real[ndarray, "h w"]
 """Values of a depth image as they are stored."""
 
 
@@ -90,7 +88,7 @@ def read_points(path: AnyPath) -> Rows:
         )
     check_suffix(path, CLOUD_READERS, "point cloud")
     with readable(path, "point cloud"):
-        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), dtype=np.float64)
+        return np.asarray(CLOUD_READERS[path.suffix.lower()](path), float)
 
 
 def valid_points(
@@ -98,7 +96,7 @@ def valid_points(
     path: AnyPath,
     drop_invalid: bool,
     cure: str = "leave them out with --drop-invalid",
-) -> Float[np.ndarray, "m c"]:
+) -> Float[ndarray, "m c"]:
     """Rows whose points, the first three columns, are measurements, as a copy. Raises as ``read_point_cloud`` does.
 
     ``path`` is where they come from, and ``cure`` what to do where others are not to be left out, for the sentences.
@@ -166,7 +164,7 @@ def is_depth_image(path: Path) -> bool:
     return False
 
 
-def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
+def metres(raw: Raw, depth_scale: float | None) -> PixelValues:
     """Depth in metres from stored values, 0 where nothing was measured.
 
     In floats NaN and infinity say so (ROS REP 118), and values from ``NOTHING_M`` up. ``depth_scale`` is the pixel
@@ -179,7 +177,7 @@ def metres(raw: Raw, depth_scale: float | None) -> Float[np.ndarray, "h w"]:
             f"the depth scale is {depth_scale}; it must be positive, in units per metre: 1000 for millimetres"
         )
     with np.errstate(invalid="ignore"):  # a NaN may be of the kind that signals
-        values = raw.astype(np.float64)
+        values = raw.astype(float)
     return np.where(np.isfinite(values) & (values < NOTHING_M), values, 0.0) / depth_scale
 
 
@@ -191,7 +189,7 @@ def depth_of(path: Path, raw: Raw, depth_scale: float | None, camera: Camera) ->
         raise ValueError(f"{path} cannot be used: {error}") from None
 
 
-def masked_depth(image: DepthImage, path: AnyPath, mask: Mask) -> DepthImage:
+def masked_depth(image: DepthImage, path: AnyPath, mask: PixelMask) -> DepthImage:
     """Depth image without what a mask leaves out; raises ``ValueError`` where nothing is left."""
     depth = np.where(mask, image.depth, 0.0)
     if not (depth > 0).any():
@@ -201,13 +199,13 @@ def masked_depth(image: DepthImage, path: AnyPath, mask: Mask) -> DepthImage:
 
 
 def usable_depth(
-    image: DepthImage, path: AnyPath, mask_path: AnyPath | None = None, mask_values: tuple[int, ...] = ()
+    image: DepthImage, path: AnyPath, mask_path: AnyPath | None = None, mask_values: WholeNumbers = ()
 ) -> DepthImage:
     """Depth image in metres without what its mask leaves out; raises ``ValueError`` as ``read_depth_image`` does.
 
     ``mask_values`` are as in ``read_mask``.
     """
-    mask = np.ones(image.depth.shape, dtype=bool)
+    mask = np.ones(image.depth.shape, bool)
     if mask_path is None and np.size(mask_values):
         raise ValueError("--mask-value says which pixels of a mask are the object, and none is given: give --mask FILE")
     if mask_path is not None:
@@ -230,7 +228,7 @@ LOSSY = ("JPEG", "MPO", "JPEG2000", "WEBP")
 """Formats (as Pillow calls them) that may store other values than they were given."""
 
 
-def read_mask(path: AnyPath, size: Size | None = None, values: tuple[int, ...] = ()) -> Mask:
+def read_mask(path: AnyPath, size: Size | None = None, values: WholeNumbers = ()) -> PixelMask:
     """Pixels of an image that show the object.
 
     These are the opaque ones of an image with transparent parts; else those that are not 0, in any channel, or that
@@ -246,12 +244,12 @@ def read_mask(path: AnyPath, size: Size | None = None, values: tuple[int, ...] =
     return _chosen_pixels(layers, f"the mask {path}", size, values)
 
 
-def mask_of_image(image: Image.Image, size: Size | None = None, values: tuple[int, ...] = ()) -> Mask:
+def mask_of_image(image: Image.Image, size: Size | None = None, values: WholeNumbers = ()) -> PixelMask:
     """Pixels of an image in memory that show the object; takes the arguments of ``read_mask`` and raises as it does."""
     return _chosen_pixels(_mask_layers(image), "the mask", size, values)
 
 
-MaskLayers = tuple[bool, np.ndarray, np.ndarray, np.ndarray]
+MaskLayers = tuple[bool, ndarray, ndarray, ndarray]
 """Whether an image's format may have changed its values; its opacity, what it shows, and its stored values."""
 
 
@@ -262,7 +260,7 @@ def _mask_layers(image: Image.Image) -> MaskLayers:
     return image.format in LOSSY, opacity, shown, np.asarray(image) if image.mode == "P" else shown
 
 
-def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: tuple[int, ...]) -> Mask:
+def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: WholeNumbers) -> PixelMask:
     is_lossy, opacity, shown, stored = layers
     channels = stored.reshape(*stored.shape[:2], -1)
     ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
@@ -304,7 +302,7 @@ def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: tup
 # --- parsers of depth images: values as stored, integers or floats ----------------------------------------------------
 
 
-def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -> Image.Image:
+def open_image(source: Path | BytesIO, formats: Names | None = None) -> Image.Image:
     """Open an image of one of some formats, to be closed by the caller, and compare the checksums of a PNG."""
     with Image.open(source, formats=formats) as image:
         if image.format == "PNG":
@@ -314,9 +312,9 @@ def open_image(source: Path | BytesIO, formats: tuple[str, ...] | None = None) -
     return Image.open(source, formats=formats)
 
 
-def in_memory(values: np.ndarray) -> np.ndarray:
+def in_memory(values: ndarray) -> ndarray:
     """Values that no longer lie in the file, with the machine's own order of bytes."""
-    return np.array(values, dtype=values.dtype.newbyteorder("="))
+    return np.array(values, values.dtype.newbyteorder("="))
 
 
 def _grey(path: Path) -> Raw:
@@ -352,7 +350,7 @@ def _npy(path: Path) -> Raw:
     array = np.load(path, allow_pickle=False)
     if array.dtype.kind not in "fiu":
         raise ValueError(f"its type is {array.dtype}, not a number")
-    return np.asarray(array)
+    return array
 
 
 DEPTH_READERS: dict[str, Callable[[Path], Raw]] = {
@@ -376,12 +374,12 @@ def _ply_points(path: Path) -> Rows:
         raise ValueError("it has 0 vertices")
     loaded: Any = trimesh.load(path, file_type="ply", resolver={}, process=False)  # no textures
     check_count(count, len(loaded.vertices), "points")
-    vertices = np.asarray(loaded.vertices, dtype=np.float64)
+    vertices = np.asarray(loaded.vertices, float)
     with suppress(LookupError, ValueError):  # which numpy raises for a name that it has not
         stated = loaded.metadata["_ply_raw"]["vertex"]["data"]
-        normals = np.stack([np.asarray(stated[name], dtype=np.float64).reshape(-1) for name in ("nx", "ny", "nz")], 1)
+        normals = np.stack([np.asarray(stated[name], float).reshape(-1) for name in ("nx", "ny", "nz")], 1)
         return np.hstack([vertices, np.nan_to_num(normals, posinf=0.0, neginf=0.0)])
-    faces = np.asarray(getattr(loaded, "faces", ()), dtype=np.int64).reshape(-1, 3)
+    faces = np.asarray(getattr(loaded, "faces", ()), np.int64).reshape(-1, 3)
     return with_normals(vertices, faces) if len(faces) else vertices
 
 
@@ -456,7 +454,7 @@ def _is_row(line: str) -> bool:
 def _array_points(path: Path) -> Points:
     with path.open("rb") as file:  # by its name, numpy would leave a damaged archive open
         loaded = np.load(file, allow_pickle=False)
-        if isinstance(loaded, np.ndarray):
+        if isinstance(loaded, ndarray):
             return _check_array(loaded)
         names = ["points"] if "points" in loaded else loaded.files
         arrays = [loaded[name] for name in names]
@@ -466,12 +464,12 @@ def _array_points(path: Path) -> Points:
     return _check_array(fitting[0])
 
 
-def _check_array(array: np.ndarray) -> Points:
+def _check_array(array: ndarray) -> Points:
     if array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise ValueError(f"its shape is {array.shape}, not [n, 3] or [h, w, 3]")
     if array.dtype.kind not in "fiu":
         raise ValueError(f"its type is {array.dtype}, not a number")
-    return array.reshape(-1, 3).astype(np.float64)
+    return array.reshape(-1, 3).astype(float)
 
 
 # --- PCD (Point Cloud Library, https://pointclouds.org/documentation/tutorials/pcd_file_format.html) -----------------
@@ -497,7 +495,7 @@ def _pcd_points(path: Path) -> Points:
         raise ValueError(f"its DATA is {layout!r}, not ascii, binary or binary_compressed")
     check_count(count, len(body) // row.itemsize, "points")
     records = np.frombuffer(body, row, count)
-    return np.stack([records[axis].astype(np.float64).reshape(count) for axis in "xyz"], axis=1)
+    return np.stack([records[axis].astype(float).reshape(count) for axis in "xyz"], axis=1)
 
 
 def _pcd_parts(content: bytes) -> tuple[dict[str, list[str]], bytes]:
@@ -518,7 +516,7 @@ def read_viewpoint(path: Path) -> Transform | None:
         return None
     with readable(path, "point cloud"), path.open("rb") as file:
         words = _pcd_parts(file.read(65536))[0].get("VIEWPOINT", ["0", "0", "0", "1", "0", "0", "0"])
-        numbers = np.array(words, dtype=np.float64)
+        numbers = np.array(words, float)
         if numbers.shape != (7,) or not np.isfinite(numbers).all() or abs(norm(numbers[3:]) - 1.0) > 1e-2:
             raise ValueError(f"its VIEWPOINT is {' '.join(words)}, not x y z and a unit quaternion qw qx qy qz")
         pose = rigid(Rotation.from_quat(numbers[3:], scalar_first=True).as_matrix(), numbers[:3])
@@ -555,7 +553,7 @@ def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Points:
     data = _lzf_decompress(body[8 : 8 + packed], unpacked)
     starts = {name: count * offset for name, (_, offset, *_) in (row.fields or {}).items()}
     axes = [np.frombuffer(data, row[axis].base, count, starts[axis]) for axis in "xyz"]
-    return np.stack([values.astype(np.float64) for values in axes], axis=1)
+    return np.stack([values.astype(float) for values in axes], axis=1)
 
 
 def _lzf_decompress(data: bytes, size: int) -> bytes:
@@ -585,7 +583,7 @@ def _lzf_decompress(data: bytes, size: int) -> bytes:
 def _zdf_points(path: Path) -> Points:
     with library("netCDF4", "sensors", path).Dataset(path) as file:
         cloud = file["data"]["pointcloud"][:]
-    return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=np.float64), np.nan))
+    return _check_array(np.ma.filled(np.ma.asarray(cloud, dtype=float), np.nan))
 
 
 CLOUD_READERS: dict[str, Callable[[Path], Rows]] = {
@@ -609,10 +607,14 @@ def read_pose(path: Path) -> Transform:
         return checked_pose(content["pose"] if isinstance(content, dict) else content)
 
 
-def read_arrays(path: Path) -> dict[str, np.ndarray]:
+Arrays = dict[str, ndarray]
+"""Arrays by their names."""
+
+
+def read_arrays(path: Path) -> Arrays:
     """All arrays of an NPZ file; raises ``SizeError``, and whatever damage makes of the parser."""
     with limited_memory(path), path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
         arrays = {key: file[key] for key in file.files}
-    if strange := [key for key, value in arrays.items() if not isinstance(value, np.ndarray)]:
+    if strange := [key for key, value in arrays.items() if not isinstance(value, ndarray)]:
         raise ValueError(f"its entry {strange[0]!r} is no array")
     return arrays

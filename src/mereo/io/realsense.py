@@ -6,17 +6,18 @@ The image is that of the depth camera, in metres by the unit that the device sta
 the colour camera sees it, with the intrinsics of that. Images are copied as they come, for the library has few buffers.
 """
 
-import time
 from collections.abc import Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 import numpy as np
 from jaxtyping import UInt16
 
 from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.conventions import Pair, WholeNumbers
 from mereo.io.config import InputConfig
 from mereo.io.errors import reason
 from mereo.io.extras import library
@@ -103,7 +104,7 @@ def _serials(rs: Any) -> list[str]:
 
 
 def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Iterator[RecordedFrame | None]:
-    topic, time_s, arrived_s = f"{REALSENSE} {Path(name).name}", 0.0, time.monotonic()
+    topic, time_s, arrived_s = f"{REALSENSE} {Path(name).name}", 0.0, monotonic()
     camera: Camera | None = None
     before: tuple[Any, float] | None = None
     try:
@@ -112,18 +113,18 @@ def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Ite
             if depth is None:
                 if playback is not None and playback.current_status() == rs.playback_status.stopped:
                     return
-                if playback is None and time.monotonic() - arrived_s >= SILENT_S:
+                if playback is None and monotonic() - arrived_s >= SILENT_S:
                     raise _silence(name, name in _serials(rs))
                 yield None
                 continue
-            image, camera = np.array(depth.get_data(), dtype=np.uint16), camera or _camera(depth, topic)
+            image, camera = np.array(depth.get_data(), np.uint16), camera or _camera(depth, topic)
             if image.shape != (camera.height, camera.width):
                 raise ValueError(resized(topic, image.shape[::-1], (camera.width, camera.height)))
             stamp = depth.get_frame_timestamp_domain(), depth.get_timestamp()
             if before is not None:  # the first frames may be stamped by another clock
                 is_same = stamp[0] == before[0]
-                time_s += max(0.0, stamp[1] - before[1]) / 1e3 if is_same else time.monotonic() - arrived_s
-            before, arrived_s = stamp, time.monotonic()
+                time_s += max(0.0, stamp[1] - before[1]) / 1e3 if is_same else monotonic() - arrived_s
+            before, arrived_s = stamp, monotonic()
             yield RecordedFrame(topic, time_s, partial(_depth_image, image, float(depth.get_units()), camera))
     finally:
         with suppress(RuntimeError):  # of a camera that is gone
@@ -152,7 +153,7 @@ def _silence(name: str, is_connected: bool) -> OSError:
     )
 
 
-def resized(name: str, size: tuple[int, ...], before: tuple[int, int]) -> str:
+def resized(name: str, size: WholeNumbers, before: Pair) -> str:
     """Sentence on a frame whose size, (width, height) in pixels, is not that of the frames before it."""
     return (
         f"{name} has {size[0]} x {size[1]} pixels, and the frames before it had {before[0]} x {before[1]}; a stream "

@@ -9,17 +9,19 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from io import BytesIO
+from math import inf, nan, pi
 from pathlib import Path
 from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
 import trimesh
+from numpy import ndarray
 from numpy.linalg import norm
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.conventions import LARGEST, Names, Range
-from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color
+from mereo.geometry.conventions import LARGEST, Names, Range, Texts
+from mereo.geometry.mesh import PALETTE, AnyMesh, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
 from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.config import RobotMeshes
@@ -73,7 +75,7 @@ class Robot:
 
     mesh: SegmentedMesh
     joints: tuple[RobotJoint, ...]
-    notes: tuple[str, ...]
+    notes: Names
 
 
 def is_robot(path: Path) -> bool:
@@ -279,7 +281,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
             name = joint.name or f"joint {number}"
             kind = kinds.get(int(model.jnt_type[number]))
             if kind is not None:
-                lower, upper = joint.range if model.jnt_limited[number] else (-np.inf, np.inf)
+                lower, upper = joint.range if model.jnt_limited[number] else (-inf, inf)
                 limit = yourdfpy.Limit(lower=float(lower), upper=float(upper))
                 mimic = _mjcf_mimic(model, mujoco, yourdfpy, number)
                 each = yourdfpy.Joint(name, kind, axis=data.xaxis[number].copy(), limit=limit, mimic=mimic)
@@ -303,7 +305,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
         for geom in geoms[is_taken] if is_taken.any() else geoms:
             T = rigid(data.geom_xmat[geom].reshape(3, 3), data.geom_xpos[geom] - place[names[body]])
             shapes += [_Shape(names[body], T, solid) for solid in _mjcf_solids(model, mujoco, int(geom))]
-    compiled = np.empty(mujoco.mj_sizeModel(model), dtype=np.uint8)
+    compiled = np.empty(mujoco.mj_sizeModel(model), np.uint8)
     mujoco.mj_saveModel(model, None, compiled)
     robot = yourdfpy.Robot(path.stem, list(links.values()), joints)
     states = ((str(path), crc32(compiled.tobytes()), len(compiled), 0),)
@@ -375,7 +377,7 @@ class _Shape(NamedTuple):
     content: trimesh.Trimesh | Path
     scale: Vector | None = None
 
-    def surfaces(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    def surfaces(self) -> Iterator[AnyMesh]:
         """Vertices and faces of its parts in its own frame."""
         if isinstance(self.content, Path):
             assert self.scale is not None
@@ -383,7 +385,7 @@ class _Shape(NamedTuple):
                 # a mirrored surface faces inwards
                 yield part.vertices * self.scale, part.faces[:, :: -1 if np.prod(self.scale) < 0 else 1]
         else:
-            yield np.asarray(self.content.vertices), np.asarray(self.content.faces, dtype=np.int64)
+            yield np.asarray(self.content.vertices), np.asarray(self.content.faces, np.int64)
 
 
 @dataclass(frozen=True)
@@ -402,7 +404,7 @@ def _assembled(content: _Described) -> Robot:
     path, joints = content.path, _from_base(content.path, content.robot)
     limits = _limits(path, joints)
     poses = {link.name: np.eye(4) for link in content.robot.links}
-    carriers: dict[str, Names] = dict.fromkeys(poses, ())
+    carriers = dict.fromkeys(poses, ())
     for joint in joints:
         poses[joint.child] = poses[joint.parent] @ _origin(joint)
         carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
@@ -435,7 +437,7 @@ def _assembled(content: _Described) -> Robot:
     return Robot(SegmentedMesh(tuple(segments)), tuple(joined), tuple(sorted(notes)))
 
 
-def _check_numbers(path: Path, name: str, values: np.ndarray) -> None:
+def _check_numbers(path: Path, name: str, values: ndarray) -> None:
     if not (np.abs(values) <= LARGEST).all():
         raise ValueError(
             f"{path}: a pose, size or limit of {name!r} is NaN, infinite or beyond {LARGEST:g}: correct it"
@@ -448,7 +450,7 @@ def _origin(element: Any) -> Transform:
 
 def _from_base(path: Path, robot: Any) -> list[Any]:
     """Joints, each after those that carry it; raises ``ValueError`` where links and joints form no tree."""
-    links, above = [link.name for link in robot.links], dict[str, str]()
+    links, above = [link.name for link in robot.links], Texts()
     for joint in robot.joints:
         if joint.parent not in links or joint.child not in links:
             raise ValueError(f"{path}: joint {joint.name!r} names a link that is not in the file: correct it")
@@ -507,9 +509,9 @@ def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, fl
 def _range(path: Path, joint: Any) -> Range:
     """Least and greatest value of a joint that follows none: of one that turns, at most a turn."""
     limits = (None, None) if joint.limit is None else (joint.limit.lower, joint.limit.upper)
-    least, most = (np.nan, np.nan) if limits == (None, None) else (limits[0] or 0.0, limits[1] or 0.0)
-    if joint.type == "continuous" or (joint.type == "revolute" and most - least > 2 * np.pi):
-        return -np.pi, np.pi
+    least, most = (nan, nan) if limits == (None, None) else (limits[0] or 0.0, limits[1] or 0.0)
+    if joint.type == "continuous" or (joint.type == "revolute" and most - least > 2 * pi):
+        return -pi, pi
     if joint.type != "fixed" and not 0 <= most - least < LARGEST:
         raise ValueError(
             f"{path}: joint {joint.name!r} has the limits {least:g} and {most:g}; it must have two, the lower first: "

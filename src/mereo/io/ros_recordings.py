@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Num, UInt8
+from numpy import ndarray
 
 from mereo.geometry.camera import Camera, DepthImage
 from mereo.geometry.transforms import Points
@@ -241,7 +242,7 @@ def depth_image(message: Any, camera: Camera, depth_scale: float | None = None) 
     return DepthImage(metres(raw, depth_scale if raw.dtype.kind != "f" else None), camera)
 
 
-def depth_pixels(message: Any) -> Num[np.ndarray, "h w"]:
+def depth_pixels(message: Any) -> Num[ndarray, "h w"]:
     """Stored values of a message of the type sensor_msgs/Image; ``ValueError``, its reason only, for no depth image."""
     kind = DEPTH_ENCODINGS.get(message.encoding)
     if kind is None:
@@ -258,18 +259,18 @@ def _compressed_depth(message: Any, camera: Camera, depth_scale: float | None) -
         raise ValueError(
             f"its format is {message.format!r}, not PNG-compressed depth ('16UC1; compressedDepth png' or 32FC1)"
         )
-    data = np.asarray(message.data, dtype=np.uint8).tobytes()
+    data = np.asarray(message.data, np.uint8).tobytes()
     with open_image(BytesIO(data[HEADER:]), ("PNG",)) as image:
         raw = np.asarray(image).astype(np.uint16)
     if DEPTH_ENCODINGS[encoding] == "u2":
         return DepthImage(metres(raw, depth_scale), camera)
-    a, b = np.frombuffer(data[4:HEADER], "<f4").astype(np.float64)
+    a, b = np.frombuffer(data[4:HEADER], "<f4").astype(float)
     with np.errstate(divide="ignore"):
         depth = np.where(raw > 0, a / (raw - b), 0.0)
     return DepthImage(depth, camera)
 
 
-def _rows(message: Any, step: int, item: int) -> UInt8[np.ndarray, "h s"]:
+def _rows(message: Any, step: int, item: int) -> UInt8[ndarray, "h s"]:
     """Bytes of each row of an image or cloud; fewer than are stated would come out as fewer pixels or points."""
     # rospy hands over bytes, which np.asarray takes for the digits of one number
     data = np.frombuffer(message.data, np.uint8) if isinstance(message.data, bytes) else np.asarray(message.data, "u1")
@@ -298,4 +299,4 @@ def cloud_points(message: Any) -> Points:
     layout: Any = {"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": message.point_step}
     rows = _rows(message, message.row_step, message.point_step)[:, : message.width * message.point_step]
     points = np.ascontiguousarray(rows).view(np.dtype(layout)).reshape(-1)
-    return np.stack([points[axis].astype(np.float64) for axis in "xyz"], axis=1)
+    return np.stack([points[axis].astype(float) for axis in "xyz"], axis=1)

@@ -12,17 +12,19 @@ from pathlib import Path
 import numpy as np
 import trimesh
 from jaxtyping import Float
+from numpy import ndarray
 
 from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Elements
 from mereo.geometry.transforms import AnyPoints, Indices, Points, longest_side
 from mereo.io.errors import readable
-from mereo.io.readers import read_arrays
+from mereo.io.readers import Arrays, read_arrays
 from mereo.io.vtk_frames import (
     COLLECTION_SUFFIXES,
     DISPLACEMENTS,
     MESHIO_SUFFIXES,
     VTK_SUFFIXES,
+    FramePoints,
     MeshFrames,
     read_vtk_frames,
 )
@@ -56,7 +58,7 @@ class TetrahedralRecord:
 
     rest_nodes: Points
     tetrahedra: Elements
-    displacements: Float[np.ndarray, "f n 3"]
+    displacements: FramePoints
     frames: Names
 
 
@@ -70,7 +72,7 @@ class SurfaceRecord:
         frames: their names, for messages.
     """
 
-    vertices: dict[str, Float[np.ndarray, "f _ 3"]]
+    vertices: dict[str, Float[ndarray, "f _ 3"]]
     rest: dict[str, AnyPoints]
     frames: Names
 
@@ -192,7 +194,7 @@ def _sequence(path: Path, names: Names, mesh: Path | None) -> TetrahedralRecord 
     )
 
 
-def _positions(path: Path, frames: MeshFrames, rest: Points | None) -> tuple[Float[np.ndarray, "f n 3"], Points | None]:
+def _positions(path: Path, frames: MeshFrames, rest: Points | None) -> tuple[FramePoints, Points | None]:
     """Positions in all frames, and those at rest where displacements say them.
 
     Points that stay are moved by their displacements. Of points that move, displacements tell the rest, if they agree.
@@ -243,7 +245,7 @@ def _mesh_frames(path: Path) -> MeshFrames:
             f"{path} has the suffix {kinds[0]!r}; states are an NPZ or NPY file, a PVD or XDMF file, or meshes "
             f"({', '.join(FRAME_SUFFIXES)}) in a directory or of a pattern: convert or rename it"
         )
-    return MeshFrames(points, None, np.empty((0, 4), dtype=np.int64), names)
+    return MeshFrames(points, None, np.empty((0, 4), np.int64), names)
 
 
 def _rest_file(path: Path) -> Path | None:
@@ -270,7 +272,7 @@ def _archive(path: Path, names: Names) -> TetrahedralRecord | SurfaceRecord:
     return SurfaceRecord(vertices, rest, _numbered(next(iter(lengths.values()))))
 
 
-def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord:
+def _tetrahedral(path: Path, arrays: Arrays) -> TetrahedralRecord:
     if unknown := sorted(set(arrays) - set(TETRAHEDRAL)):
         raise ValueError(
             f"{path} has the array {unknown[0]!r}; known are {', '.join(TETRAHEDRAL)}: remove or rename it"
@@ -291,9 +293,9 @@ def _tetrahedral(path: Path, arrays: dict[str, np.ndarray]) -> TetrahedralRecord
     return TetrahedralRecord(rest, elements, moved - rest if key == "nodes" else moved, frames)
 
 
-def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Points, Elements]:
+def _volume(path: Path, arrays: Arrays) -> tuple[Points, Elements]:
     """Nodes and tetrahedra of an archive."""
-    rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(np.float64)
+    rest = _floats(path, "rest_nodes", arrays["rest_nodes"], 2).astype(float)
     elements = arrays["tetrahedra"]
     if elements.ndim != 2 or elements.shape[1] != 4 or not np.issubdtype(elements.dtype, np.integer):
         raise ValueError(
@@ -303,7 +305,7 @@ def _volume(path: Path, arrays: dict[str, np.ndarray]) -> tuple[Points, Elements
     return rest, elements.astype(np.int64)
 
 
-def _floats(path: Path, key: str, array: np.ndarray, axes: int) -> np.ndarray:
+def _floats(path: Path, key: str, array: ndarray, axes: int) -> ndarray:
     """Positions [..., 3] that are finite; the first bad frame or row is named."""
     wanted = "[frames, vertices, 3]" if axes == 3 else "[vertices, 3]"
     if array.ndim != axes or array.shape[-1] != 3 or not np.issubdtype(array.dtype, np.floating):
@@ -371,7 +373,7 @@ def _surface(folder: Path, name: str) -> SurfaceRecord:
     return SurfaceRecord({name: nodes}, {name: record.rest_nodes}, record.frames)
 
 
-def _check_topology(path: Path, states: dict[str, np.ndarray]) -> None:
+def _check_topology(path: Path, states: Arrays) -> None:
     """Raise ``ValueError`` where states have other numbers of vertices than the first of them."""
     first = next(iter(states))
     for state, vertices in states.items():
@@ -388,9 +390,9 @@ def mesh_vertices(path: Path) -> AnyPoints:
         if path.suffix.lower() == ".obj":  # trimesh orders an OBJ file's vertices by faces and texture seams
             lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
             rows = [line.split()[1:4] for line in lines if line.startswith(("v ", "v\t"))]
-            vertices = np.array(rows, dtype=np.float64).reshape(-1, 3)
+            vertices = np.array(rows, float).reshape(-1, 3)
         else:
-            vertices = np.asarray(trimesh.load_mesh(path, process=False).vertices, dtype=np.float64)
+            vertices = np.asarray(trimesh.load_mesh(path, process=False).vertices, float)
         if len(vertices) == 0:
             raise ValueError("it has no vertices")
     return vertices

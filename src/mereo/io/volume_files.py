@@ -16,14 +16,17 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Integer, Shaped
+from jaxtyping import Float32, Int, Integer, Shaped
+from numpy import ndarray
+from numpy.linalg import det, inv, norm
 from scipy.ndimage import gaussian_filter
 
 from mereo.geometry.brief import listed
-from mereo.geometry.labels import part_of_grid
+from mereo.geometry.conventions import Texts, WholeNumbers
+from mereo.geometry.labels import VoxelMask, part_of_grid
 from mereo.geometry.marching_cubes import zero_surface
 from mereo.geometry.mesh import PALETTE, Color, Segment, SegmentedMesh, palette_color
-from mereo.geometry.transforms import Corners, Flags, Points, Transform, Vector, transform_points
+from mereo.geometry.transforms import Corners, Flags, Points, Transform, Vector, box_of, transform_points
 from mereo.io.config import Space
 from mereo.io.errors import check_size, limited_memory, quiet, readable
 from mereo.io.extras import library
@@ -49,7 +52,7 @@ class Volume:
         header: of the file, nibabel's or pynrrd's, for what else it says; None for a volume without a file.
     """
 
-    values: Shaped[np.ndarray, "..."]
+    values: Shaped[ndarray, "..."]
     T_world_index: Transform
     slope: float = 1.0
     intercept: float = 0.0
@@ -58,18 +61,18 @@ class Volume:
     @property
     def spacing(self) -> Vector:
         """Distance between voxel centres along each axis."""
-        return np.linalg.norm(self.T_world_index[:3, :3], axis=0)
+        return norm(self.T_world_index[:3, :3], axis=0)
 
     @property
     def bounds(self) -> Corners:
         """Axis-aligned box of the voxels, their own extent included."""
         ends = product(*([-0.5, n - 0.5] for n in self.values.shape))
         corners = transform_points(self.T_world_index, np.array(list(ends)))
-        return np.stack([corners.min(axis=0), corners.max(axis=0)])
+        return box_of(corners)
 
     def index_of(self, points: Points) -> Points:
         """Voxel indices, with fractions, of positions."""
-        return transform_points(np.linalg.inv(self.T_world_index), points)
+        return transform_points(inv(self.T_world_index), points)
 
     def holds(self, index: Points) -> Flags:
         """Whether indices with fractions lie in a voxel."""
@@ -79,7 +82,7 @@ class Volume:
         """Share of points that lie in voxels above the mean: in tissue, and not in air or empty space."""
         index = np.rint(self.index_of(points)).astype(np.int64)
         held = np.all((index >= 0) & (index < self.values.shape), axis=1)
-        values = self.values[tuple(index[held].T)].astype(np.float64)
+        values = self.values[tuple(index[held].T)].astype(float)
         return float((np.sign(self.slope) * (values - self.values.mean()) > 0).sum() / len(points))
 
 
@@ -103,7 +106,7 @@ def read_volume(path: Path, kind: str = "volume") -> Volume:
             f"{path} has voxels of the type {volume.values.dtype}; each must be one real number: export one channel"
         )
     matrix = volume.T_world_index
-    if not (np.isfinite(matrix).all() and abs(np.linalg.det(matrix)) > 1e-12 * np.prod(volume.spacing) > 0):
+    if not (np.isfinite(matrix).all() and abs(det(matrix)) > 1e-12 * np.prod(volume.spacing) > 0):
         raise ValueError(
             f"{path} has voxels whose axes are {matrix[:3, :3].T.tolist()}; they must span space: export it again"
         )
@@ -130,7 +133,7 @@ def _nrrd(nrrd: Any, path: Path) -> Volume:
     transform = np.eye(4)
     directions = header.get("space directions")
     if directions is not None:
-        transform[:3, :3] = np.asarray(directions, dtype=float)[-3:].T  # a row for each axis of the array
+        transform[:3, :3] = np.asarray(directions, float)[-3:].T  # a row for each axis of the array
     elif "spacings" in header:
         transform[:3, :3] = np.diag(header["spacings"][-3:])
     transform[:3, 3] = header.get("space origin", np.zeros(3))
@@ -190,7 +193,7 @@ def read_scalar_volume(path: Path) -> Volume:
     return volume
 
 
-def segment_fields(header: Any) -> dict[str, str]:
+def segment_fields(header: Any) -> Texts:
     """Fields about the segments of a segmentation of 3D Slicer (``.seg.nrrd``), of a header of any format."""
     fields = header if isinstance(header, Mapping) else {}
     return {key: str(value) for key, value in fields.items() if key.startswith("Segment")}
@@ -225,13 +228,13 @@ class LabelVolume:
         names, colors: of labels, where the file has them.
     """
 
-    labels: Integer[np.ndarray, "l x y z"]
+    labels: Integer[ndarray, "l x y z"]
     T_world_index: Transform
     names: Mapping[int, str]
     colors: Mapping[int, Color] = field(default_factory=dict)
 
     @cached_property
-    def values(self) -> tuple[int, ...]:
+    def values(self) -> WholeNumbers:
         """Labels above 0 that occur."""
         slices = (part for layer in self.labels for part in np.moveaxis(layer, 2, 0) if part.any())
         return tuple(sorted({int(value) for part in slices for value in np.unique(part)} - {0}))
@@ -294,7 +297,7 @@ class _SlicerSegment(NamedTuple):
 
 def _slicer_segments(volume: Volume) -> list[_SlicerSegment]:
     """Segments that the header of a segmentation lists; older ones have a layer each."""
-    parts = dict[int, dict[str, str]]()
+    parts = dict[int, Texts]()
     for key, text in segment_fields(volume.header).items():
         if match := re.fullmatch(r"Segment(\d+)_(\w+)", key):
             parts.setdefault(int(match[1]), {})[match[2]] = text
@@ -309,10 +312,10 @@ def _slicer_segments(volume: Volume) -> list[_SlicerSegment]:
 
 
 def _renumbered(
-    path: Path, layers: Integer[np.ndarray, "l x y z"], segments: Sequence[_SlicerSegment]
-) -> Integer[np.ndarray, "l x y z"]:
+    path: Path, layers: Integer[ndarray, "l x y z"], segments: Sequence[_SlicerSegment]
+) -> Integer[ndarray, "l x y z"]:
     """Layers in which each segment has its number, from 1 up, as its label: files use a label once for each layer."""
-    result = np.zeros(layers.shape, dtype=np.int16)
+    result = np.zeros(layers.shape, np.int16)
     for number, segment in enumerate(segments, start=1):
         if not 0 <= segment.layer < len(layers):
             raise ValueError(
@@ -326,7 +329,7 @@ def _renumbered(
 
 def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
     """Label volume of files with a segment each."""
-    layers, names, empty = list[np.ndarray](), dict[int, str](), list[str]()
+    layers, names, empty = list[ndarray](), dict[int, str](), list[str]()
     for number, path in enumerate(paths, start=1):
         volume = read_label_volume(path)
         if len(volume.values) > 1:
@@ -344,7 +347,7 @@ def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
         mask = volume.labels[0] > 0
         free = (layer for layer in layers if not layer[mask].any())
         if (layer := next(free, None)) is None:
-            layers.append(layer := np.zeros(mask.shape, dtype=np.int16))
+            layers.append(layer := np.zeros(mask.shape, np.int16))
         layer[mask] = number
     if empty:
         text = f"{len(empty)} of {len(paths)} label volumes hold only empty space and are left out: {', '.join(empty)}"
@@ -365,11 +368,8 @@ def _check_same_grid(path: Path, volume: LabelVolume, other_path: Path, other: L
 
 # --- surfaces of labels: closed, smoothed, neighbours in contact ------------------------------------------------------
 
-Share = Float32[np.ndarray, "a b c"]
+Share = Float32[ndarray, "a b c"]
 """Share of a segment in each cell of a grid, or what is positive inside it."""
-
-Mask = Bool[np.ndarray, "x y z"]
-"""Voxels of a segment."""
 
 SMOOTHING = 0.8
 """Standard deviation of the smoothing, in the longest side of a cell: enough against stairs, and little volume lost."""
@@ -395,7 +395,7 @@ NESTED = 0.95
 class ThinSegmentError(ValueError):
     """Refusal of segments that are too thin for a grid: ``thin`` has a sentence for each."""
 
-    def __init__(self, thin: dict[str, str]) -> None:
+    def __init__(self, thin: Texts) -> None:
         super().__init__(next(iter(thin.values())))
         self.thin = thin
 
@@ -425,7 +425,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     parents = _part_masks(masks)
     grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
-    thin, parts, cell = dict[str, str](), list[Segment](), abs(float(np.linalg.det(volume.T_world_index[:3, :3])))
+    thin, parts, cell = Texts(), list[Segment](), abs(float(det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
         part = grid.surface(margin, name, volume.colors.get(labels[index][0], palette_color(index)))
         kept = 0.0 if part is None else part.volume / (float(masks[index].sum()) * cell)
@@ -446,7 +446,7 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
     return SegmentedMesh(tuple(parts[index] for index in order), nested)
 
 
-def _part_masks(masks: list[Mask]) -> dict[int, int]:
+def _part_masks(masks: list[VoxelMask]) -> dict[int, int]:
     """Make masks nested or apart, in place; returns those that are nested, from the smallest on, and what is around."""
     sizes = [int(mask.sum()) for mask in masks]
     order, parents = sorted(range(len(masks)), key=lambda index: sizes[index]), dict[int, int]()
@@ -501,34 +501,34 @@ def _margins(shares: Sequence[Share], parents: Mapping[int, int]) -> list[Share]
 class _Grid:
     """A coarser grid over part of a volume, from the voxel ``first`` on: ``counts`` cells of ``block`` voxels each."""
 
-    first: Int[np.ndarray, "3"]
-    counts: Int[np.ndarray, "3"]
-    block: Int[np.ndarray, "3"]
+    first: Int[ndarray, "3"]
+    counts: Int[ndarray, "3"]
+    block: Int[ndarray, "3"]
     T_world_index: Transform
 
     @classmethod
     def around(
         cls,
-        mask: Mask,
+        mask: VoxelMask,
         transform: Transform,
         cells: int,
     ) -> "_Grid":
         """Grid over all that is set, with about ``cells`` along the longest side; cells are whole numbers of voxels."""
         sides = [np.flatnonzero(mask.any(axis=tuple({0, 1, 2} - {axis}))) for axis in range(3)]
         first, end = np.array([side[0] for side in sides]), np.array([side[-1] + 1 for side in sides])
-        voxel = np.linalg.norm(transform[:3, :3], axis=0)
+        voxel = norm(transform[:3, :3], axis=0)
         wanted = ((end - first) * voxel).max() / cells
         block = np.maximum(np.rint(wanted / voxel).astype(np.int64), 1)
         return cls(first, -(-(end - first) // block), block, transform)
 
-    def share(self, mask: Mask) -> tuple[Share, float]:
+    def share(self, mask: VoxelMask) -> tuple[Share, float]:
         """Share of each cell that is set, smoothed, with ``MARGIN`` empty cells around; and the one at the surface."""
         end = np.minimum(self.first + self.counts * self.block, mask.shape)
         part = mask[part_of_grid(self.first, end)]
         part = np.pad(part, [(0, int(n)) for n in self.counts * self.block - part.shape])
         (a, b, c), (i, j, k) = self.counts, self.block
         means = np.pad(part.reshape(a, i, b, j, c, k).mean(axis=(1, 3, 5), dtype=np.float32), MARGIN)
-        cell = self.block * np.linalg.norm(self.T_world_index[:3, :3], axis=0)
+        cell = self.block * norm(self.T_world_index[:3, :3], axis=0)
         smooth: Share = gaussian_filter(means, SMOOTHING * cell.max() / cell, mode="constant")
         whole = float(means.sum()) * float(np.prod(cell))
         if self.enclosed(smooth) >= WHOLE * whole:
@@ -557,5 +557,5 @@ class _Grid:
         index = (vertices - MARGIN + 0.5) * self.block - 0.5 + self.first
         world = transform_points(self.T_world_index, index)
         # voxel axes may be left-handed
-        turned = -1 if np.linalg.det(self.T_world_index[:3, :3]) < 0 else 1
+        turned = -1 if det(self.T_world_index[:3, :3]) < 0 else 1
         return Segment(name, color, world, faces[:, ::turned])

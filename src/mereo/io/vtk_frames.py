@@ -18,9 +18,11 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 
 from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Elements
+from mereo.io.atomic_files import JsonObject
 from mereo.io.errors import limited_memory, printable_line, readable, reason
 
 VTK_SUFFIXES = (".vtk", ".vtu", ".vtp")
@@ -37,6 +39,9 @@ DISPLACEMENTS = ("displacement", "displacements", "disp", "u")
 
 CHILD = f"import sys; sys.path.append(sys.argv[2]); from {__name__} import main; main(sys.argv[1])"
 
+FramePoints = Float[ndarray, "f n 3"]
+"""Positions in each frame of a sequence."""
+
 ANSWER, REFUSAL = "frames.npz", "refusal.txt"
 """Files of the child's answer, one of which it writes."""
 
@@ -52,8 +57,8 @@ class MeshFrames:
         frames: their names, for messages.
     """
 
-    points: Float[np.ndarray, "f n 3"]
-    displacements: Float[np.ndarray, "f n 3"] | None
+    points: FramePoints
+    displacements: FramePoints | None
     tetrahedra: Elements
     frames: Names
 
@@ -119,10 +124,10 @@ def main(place: str) -> None:
     partial.rename(folder / ANSWER)  # VTK may still crash at its end, but not before all is written
 
 
-def _answer(files: Sequence[str], log: Any, read: list[str]) -> dict[str, Any]:
+def _answer(files: Sequence[str], log: Any, read: list[str]) -> JsonObject:
     """Arrays of all frames; ``read`` grows by each file that is done."""
-    names, points, moved = list[str](), list[np.ndarray](), list[np.ndarray]()
-    tetrahedra = np.empty((0, 4), dtype=np.int64)
+    names, points, moved = list[str](), list[ndarray](), list[ndarray]()
+    tetrahedra = np.empty((0, 4), np.int64)
     for file in files:
         for step, data in enumerate(_steps(file)):
             if "ERROR: In" in log.GetOutput():
@@ -133,9 +138,9 @@ def _answer(files: Sequence[str], log: Any, read: list[str]) -> dict[str, Any]:
             if not points:
                 tetrahedra = _tetrahedra(mesh)
             names.append(Path(file).name if len(files) > 1 else f"{step}")
-            points.append(np.array(mesh.points, dtype=np.float64))
+            points.append(np.array(mesh.points, float))
             if displacement is not None:
-                moved.append(np.array(mesh.point_data[displacement], dtype=np.float64))
+                moved.append(np.array(mesh.point_data[displacement], float))
         read.append(file)
     if not points:
         raise ValueError("it has no frames")
@@ -214,13 +219,13 @@ def _displacement(mesh: Any) -> str | None:
     return next((names[name] for name in DISPLACEMENTS if name in names), None)
 
 
-def _tetrahedra(mesh: Any) -> np.ndarray:
+def _tetrahedra(mesh: Any) -> ndarray:
     """Tetrahedra [m, 4] of a mesh; hexahedra, wedges and pyramids are divided, their nodes stay."""
     import pyvista
 
     if not isinstance(mesh, pyvista.UnstructuredGrid):
-        return np.empty((0, 4), dtype=np.int64)
+        return np.empty((0, 4), np.int64)
     kind = pyvista.CellType.TETRA
     solid = mesh if kind in mesh.celltypes else mesh.triangulate()
     cells: Any = solid.cells_dict
-    return np.asarray(cells[kind] if kind in cells else np.empty((0, 4)), dtype=np.int64)
+    return np.asarray(cells[kind] if kind in cells else np.empty((0, 4)), np.int64)

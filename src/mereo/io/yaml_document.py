@@ -64,7 +64,7 @@ class Document:
             for item in node.value:
                 self._refuse_repeated(item)
         elif isinstance(node, yaml.MappingNode):
-            seen: set[str] = set()
+            seen = set[str]()
             for key, value in node.value:
                 if key.value in seen:
                     line = key.start_mark.line + 1

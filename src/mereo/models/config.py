@@ -4,14 +4,13 @@ Light, so that the command line may import them. Defaults are the paper's (Henri
 appendix B) unless a comment says otherwise; what it leaves open is chosen as docs/method.md tells.
 """
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Annotated, Any, Literal
 
-from tyro.conf import arg
-
+from mereo.geometry.conventions import Facts, WholeNumbers
 from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import (
+    GROUP,
     Count,
     CountOrNone,
     Depth,
@@ -29,6 +28,9 @@ from mereo.io.bounds import (
     check_bounds,
     check_values,
 )
+
+ExportFormat = Literal["onnx", "torch"]
+"""For ONNX Runtime, or of torch.export."""
 
 Device = Literal["auto", "cpu", "cuda"]
 
@@ -241,11 +243,11 @@ class NetworkConfig:
     encoder: Encoder = "pointnet2"
     points: Points = 1024
     # empty names keep the options --network.width, --network.mlp1 and so on, without those of the parts
-    pointnet2: Annotated[PointNet2Config, arg(name="")] = field(default_factory=PointNet2Config)
-    transformer: Annotated[PointTransformerConfig, arg(name="")] = field(default_factory=PointTransformerConfig)
-    autodecoder: Annotated[AutodecoderConfig, arg(name="")] = field(default_factory=AutodecoderConfig)
-    decoder: Annotated[DecoderConfig, arg(name="")] = field(default_factory=DecoderConfig)
-    additions: Annotated[AdditionsConfig, arg(name="")] = field(default_factory=AdditionsConfig)
+    pointnet2: Annotated[PointNet2Config, GROUP] = PointNet2Config()
+    transformer: Annotated[PointTransformerConfig, GROUP] = PointTransformerConfig()
+    autodecoder: Annotated[AutodecoderConfig, GROUP] = AutodecoderConfig()
+    decoder: Annotated[DecoderConfig, GROUP] = DecoderConfig()
+    additions: Annotated[AdditionsConfig, GROUP] = AdditionsConfig()
 
     def __post_init__(self) -> None:
         check_bounds(self, "network.")
@@ -256,7 +258,7 @@ class NetworkConfig:
         return self.pointnet2.mlp_global[-1]
 
     @property
-    def level_widths(self) -> tuple[int, ...]:
+    def level_widths(self) -> WholeNumbers:
         """Numbers of channels of the encoder's levels that queries can attend to."""
         if self.encoder == "autodecoder":
             return ()
@@ -272,7 +274,7 @@ class NetworkConfig:
         return {name: value for name, value in settings.items() if value or name != "spread_penalty"}
 
     @classmethod
-    def from_dict(cls, settings: Mapping[str, Any]) -> "NetworkConfig":
+    def from_dict(cls, settings: Facts) -> "NetworkConfig":
         """Settings from ``to_dict``, also after a trip through JSON.
 
         Raises:
@@ -281,7 +283,7 @@ class NetworkConfig:
         given = {name: tuple(value) if isinstance(value, list) else value for name, value in settings.items()}
         for part in (cls, *PARTS.values()):
             check_values(part, given, "network.")
-        parts: dict[str, Any] = {
+        parts = {
             name: part(**{item.name: given.pop(item.name) for item in fields(part) if item.name in given})
             for name, part in PARTS.items()
         }

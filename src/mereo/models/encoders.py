@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from mereo.geometry.conventions import WholeNumbers
 from mereo.models.config import AutodecoderConfig, PointNet2Config, PointTransformerConfig
 from mereo.models.device import exact
 from mereo.models.neighbors import CloudBatch, NeighborIndices, ball_query, distinct_distances, gather
@@ -47,9 +48,9 @@ def share(count: int, ratio: float) -> int:
 class SharedMLP(nn.Module):
     """Layers of linear map, batch normalization and ReLU, shared by all rows."""
 
-    def __init__(self, widths: tuple[int, ...]) -> None:
+    def __init__(self, widths: WholeNumbers) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
+        layers = list[nn.Module]()
         for before, after in pairwise(widths):
             # the bias would be removed by the batch mean
             layers += [nn.Linear(before, after, bias=False), nn.BatchNorm1d(after), nn.ReLU()]
@@ -73,7 +74,7 @@ class SharedMLP(nn.Module):
 class SetAbstraction(nn.Module):
     """Small PointNet on the ball around each centre: ``max_j mlp([f_j, p_j - p_i])`` (PointNet++, section 3.2)."""
 
-    def __init__(self, channels: int, radius: float, neighbors: int, widths: tuple[int, ...]) -> None:
+    def __init__(self, channels: int, radius: float, neighbors: int, widths: WholeNumbers) -> None:
         super().__init__()
         self.radius, self.neighbors = radius, neighbors
         self.mlp = SharedMLP((channels + 3, *widths))
@@ -196,7 +197,7 @@ class PointTransformer(nn.Module):
         distances = distinct_distances(cloud)
         count = cloud.shape[1]
         features = self.blocks[0](cloud, self.enter(cloud), _smallest(distances, max(1, self.neighbors // 2)))
-        levels: list[Level] = []
+        levels = list[Level]()
         for down, block in zip(self.down, self.blocks[1:], strict=True):
             before, count = count, torch.sym_max(1, count // STRIDE)
             features = down(features, _smallest(distances[:, :count, :before], self.neighbors))

@@ -22,7 +22,7 @@ from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import Names
 from mereo.geometry.downsampling import farthest_point_order, random_subset
-from mereo.geometry.mesh import Color
+from mereo.geometry.mesh import Nested, SegmentColors
 from mereo.geometry.transforms import Normalizer, Points, Rows
 from mereo.models.calibration import Calibration, Scaling
 from mereo.models.config import Precision, Supervision
@@ -69,11 +69,11 @@ class Model:
 
     network: Network
     names: Names
-    colors: tuple[Color, ...]
+    colors: SegmentColors
     loss: str = "ce+l1"
     provenance: dict[str, object] = field(default_factory=dict)
     domain: Box | None = None
-    nested: tuple[tuple[str, str], ...] = ()
+    nested: Nested = ()
     precision: Precision = "float32"
     statistical_model: StatisticalModel | None = None
     calibration: Calibration | None = None
@@ -127,9 +127,9 @@ class Model:
 
         Raises ``ValueError`` on unusable clouds.
         """
-        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
+        cloud = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, float))
         ordered, normalizer = self.normalized_cloud(cloud)
-        seen = ordered[0, : len(cloud)].numpy().astype(np.float64)
+        seen = ordered[0, : len(cloud)].numpy().astype(float)
         with self.answering():
             viewpoint = torch.from_numpy(normalizer.viewpoint[None].astype(np.float32))
             code = self.inference.encode(ordered.to(self.device), viewpoint.to(self.device))
@@ -183,7 +183,7 @@ class Model:
             return self.class_logits(prediction, queries).softmax(dim=-1), prediction.rest
 
         probability, rest = self._chunked(code, points, answer)
-        return probability, rest.astype(np.float64)
+        return probability, rest.astype(float)
 
     def respond(
         self, prediction: Prediction, queries: QueryBatch
@@ -232,7 +232,7 @@ class Model:
         answer: Callable[[Prediction, Tensor], tuple[Tensor, ...]],
     ) -> list[np.ndarray]:
         """Parts of the answers at all points, computed chunk by chunk."""
-        normalized = code.normalizer.apply(np.asarray(points, dtype=np.float64)).astype(np.float32)
+        normalized = code.normalizer.apply(np.asarray(points, float)).astype(np.float32)
         size, most = (CUDA_QUERY_CHUNK, 1) if self.device.type == "cuda" else (CPU_QUERY_CHUNK, MOST)
         network = self.inference  # made by one thread, this one
 

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy import ndarray
 from scipy.spatial import KDTree
 from torch import Tensor
 
@@ -63,13 +64,11 @@ def _by_rank(centers: Float[Tensor, "b m 3"], points: CloudBatch, radius: float,
 @torch.library.custom_op("mereo::ball_query", mutates_args=())
 def _by_pairs(centers: Tensor, points: Tensor, radius: float, limit: int) -> Tensor:
     """Ball query by the list of near pairs: most are not. An operator, so that a compiled network can call it."""
-    clouds = zip(centers.numpy().astype(np.float64), points.numpy().astype(np.float64), strict=True)
+    clouds = zip(centers.numpy().astype(float), points.numpy().astype(float), strict=True)
     return torch.from_numpy(np.stack([_first_in_ball(c, p, radius, limit) for c, p in clouds]))
 
 
-def _first_in_ball(
-    centers: Float[np.ndarray, "m 3"], points: Points, radius: float, limit: int
-) -> Int[np.ndarray, "m k"]:
+def _first_in_ball(centers: Float[ndarray, "m 3"], points: Points, radius: float, limit: int) -> Int[ndarray, "m k"]:
     # |c - p|^2 - r^2 as one product of five columns with five rows; in double precision nothing is lost
     lengths = (centers * centers).sum(axis=1) - radius * radius
     left = np.column_stack([-2 * centers, np.ones(len(centers)), lengths])
@@ -115,7 +114,7 @@ def _(queries: Tensor, points: Tensor, count: int) -> Tensor:
     return queries.new_empty((*queries.shape[:2], count), dtype=torch.long)
 
 
-def _by_tree(queries: Float[np.ndarray, "q d"], points: Float[np.ndarray, "n d"], count: int) -> Int[np.ndarray, "q k"]:
+def _by_tree(queries: Float[ndarray, "q d"], points: Float[ndarray, "n d"], count: int) -> Int[ndarray, "q k"]:
     workers = torch.get_num_threads() if len(queries) >= THREADED_QUERIES else 1
     ranks = np.arange(1, count + 1)  # a list keeps the last axis where one number would drop it
     tree = _tree(points.tobytes(), points.dtype.str, points.shape[1])

@@ -14,7 +14,7 @@ import numpy as np
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import MIN_POINTS, Names
-from mereo.geometry.mesh import Color
+from mereo.geometry.mesh import Nested, SegmentColors
 from mereo.geometry.transforms import Labels, Normalizer, Points, Rows, Values
 from mereo.models.calibration import Calibration
 from mereo.scenes.statistical_model import StatisticalModel
@@ -72,11 +72,11 @@ class Trained(Protocol):
         """Names of the segments."""
 
     @property
-    def colors(self) -> tuple[Color, ...]:
+    def colors(self) -> SegmentColors:
         """Colours of the segments."""
 
     @property
-    def nested(self) -> tuple[tuple[str, str], ...]:
+    def nested(self) -> Nested:
         """Pairs of names (inner, outer)."""
 
     @property
@@ -131,7 +131,7 @@ def check_enough(count: int, message: str) -> None:
 
 def checked_points(cloud: PointCloud) -> Points:
     """Points of a cloud as float64, or ``ValueError`` with one sentence on why they cannot be used."""
-    points = np.asarray(cloud.points, dtype=np.float64)
+    points = np.asarray(cloud.points, float)
     check_enough(len(points), f"the cloud has {len(points)} points")
     if (points[:, 2] <= 0).any():
         raise ValueError(

@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
+from mereo.geometry.conventions import Texts
 from mereo.io.atomic_files import JsonObject, write_file
 from mereo.io.errors import AnyPath, reason
 from mereo.models.calibration import Calibration
@@ -195,7 +196,7 @@ def with_calibration(name: AnyPath, calibration: Calibration) -> bytes:
     return save(tensors, metadata={**metadata, "mereo": json.dumps(header)})
 
 
-def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
+def _read(path: Path) -> tuple[dict[str, Tensor], Texts]:
     """Tensors and metadata of a safetensors file; ``ValueError`` for another file."""
     try:
         with safe_open(path, framework="pt") as file:

@@ -13,6 +13,9 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.linalg import eigh, norm
+from numpy.random import Generator, default_rng
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -22,7 +25,7 @@ from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import MIN_POINTS, CloudAxes
 from mereo.geometry.downsampling import MAX_POINTS, spacing, thin_to_grid
 from mereo.geometry.surface_patches import STRETCH, stretch, surface_patches
-from mereo.geometry.transforms import AnyPoints, Flags, Indices, Points, Values, Vector, transform_points
+from mereo.geometry.transforms import AnyPoints, Flags, Indices, Points, Values, Vector, box_of, transform_points
 from mereo.reconstruction.config import IsolationConfig
 
 PLANE_SPACINGS = 3.0
@@ -112,12 +115,12 @@ def select_object(
     Raises ``ValueError`` where fewer than ``MIN_POINTS`` points are left, naming the step and its cure.
     """
     points, rows, done = cloud.points, np.arange(len(cloud)), list[IsolationStep]()
-    thinned, compared = np.zeros(len(cloud), dtype=bool), np.ones(len(cloud), dtype=bool)
+    thinned, compared = np.zeros(len(cloud), bool), np.ones(len(cloud), bool)
     for name, step in _steps(config, unit_m, frame):
         keep, detail = step(points)
         left = int(keep.sum())
         if left < MIN_POINTS:
-            box = unit_m * np.stack([points.min(axis=0), points.max(axis=0)])
+            box = unit_m * box_of(points)
             corners = " to ".join(f"({', '.join(f'{value:.3g}' for value in corner)})" for corner in box)
             raise ValueError(
                 f"the step {name!r} leaves {left} of {len(points)} points, which reach from {corners} m; the object "
@@ -129,7 +132,7 @@ def select_object(
             thinned[rows[~keep]] = True
             compared = np.isin(np.arange(len(cloud)), rows[keep])
         points, rows = points[keep], rows[keep]
-    kept = np.zeros(len(cloud), dtype=bool)
+    kept = np.zeros(len(cloud), bool)
     kept[rows] = True
     return Selection(kept, compared, thinned, tuple(done))
 
@@ -170,8 +173,8 @@ def _off_plane(points: Points, unit_m: float, frame: CloudAxes) -> Keep:
     middle = np.median(points[:, 2])
     if frame == "camera" and middle > 0:  # what lies behind the camera is refused later
         tolerance *= np.maximum(points[:, 2] / middle, 1.0) ** 2
-    plane = largest_plane(points, tolerance, np.random.default_rng(0))
-    off = np.ones(len(points), dtype=bool) if plane is None else plane.distance(points) > tolerance
+    plane = largest_plane(points, tolerance, default_rng(0))
+    off = np.ones(len(points), bool) if plane is None else plane.distance(points) > tolerance
     share = 1.0 - off.mean()
     if plane is None or share < PLANE_SHARE:
         raise ValueError(
@@ -183,7 +186,7 @@ def _off_plane(points: Points, unit_m: float, frame: CloudAxes) -> Keep:
 
 
 def _thinned(points: Points) -> Keep:
-    keep = np.zeros(len(points), dtype=bool)
+    keep = np.zeros(len(points), bool)
     keep[thin_to_grid(points, MAX_POINTS)] = True
     return keep, "one in each cell of a grid"
 
@@ -199,13 +202,13 @@ def clusters(points: Points) -> Indices:
     count = min(CLUSTER_NEIGHBORS, len(points) - 1) + 1
     gap = CLUSTER_GAP * spacing(points)
     if gap == 0:  # all at one place
-        return np.zeros(len(points), dtype=np.int64)
+        return np.zeros(len(points), np.int64)
     distance, neighbor = cKDTree(points).query(points, k=range(1, count + 1), distance_upper_bound=gap)
     row, column = np.nonzero(np.isfinite(distance))
-    edges = (np.ones(len(row), dtype=np.int8), (row, neighbor[row, column]))
+    edges = (np.ones(len(row), np.int8), (row, neighbor[row, column]))
     label = connected_components(coo_matrix(edges, shape=(len(points),) * 2), directed=False)[1]
     rank = np.argsort(np.argsort(-np.bincount(label), kind="stable"))
-    return np.asarray(rank[label], dtype=np.int64)
+    return np.asarray(rank[label], np.int64)
 
 
 def _largest_cluster(points: Points, gap: float) -> Keep:
@@ -260,7 +263,7 @@ class Plane:
         return np.abs(points @ self.normal - self.offset)
 
 
-def largest_plane(points: Points, tolerance: Values, rng: np.random.Generator) -> Plane | None:
+def largest_plane(points: Points, tolerance: Values, rng: Generator) -> Plane | None:
     """Plane with the most points within ``tolerance``; None where no three points span one.
 
     Args:
@@ -283,15 +286,15 @@ def largest_plane(points: Points, tolerance: Values, rng: np.random.Generator) -
         kept = points[plane.distance(points) <= tolerance]
         if len(kept) >= 3:
             center = kept.mean(axis=0)
-            normal = np.linalg.eigh(np.cov((kept - center).T))[1][:, 0]
+            normal = eigh(np.cov((kept - center).T))[1][:, 0]
             plane = Plane(normal, float(normal @ center))
     return plane
 
 
-def _through(triples: Float[np.ndarray, "t 3 3"]) -> tuple[Float[np.ndarray, "u 3"], Float[np.ndarray, " u"]]:
+def _through(triples: Float[ndarray, "t 3 3"]) -> tuple[Float[ndarray, "u 3"], Float[ndarray, " u"]]:
     """Planes through three points each; triples on a line are left out."""
     normals = np.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    lengths = np.linalg.norm(normals, axis=1)
+    lengths = norm(normals, axis=1)
     proper = lengths > 1e-12 * np.ptp(triples.reshape(-1, 3), axis=0).max() ** 2
     normals = normals[proper] / lengths[proper, None]
     return normals, np.einsum("ti,ti->t", normals, triples[proper, 0])
@@ -332,7 +335,7 @@ class Reading:
     @classmethod
     def of_all(cls, whole: PointCloud) -> "Reading":
         """The reading with every point."""
-        return cls(whole, np.ones(len(whole), dtype=bool))
+        return cls(whole, np.ones(len(whole), bool))
 
     @cached_property
     def cloud(self) -> PointCloud:
@@ -379,7 +382,7 @@ def readings(cloud: PointCloud | Points, axes: CloudAxes = "camera", keep_all: b
 
     Raises ``ValueError`` for points that are not finite.
     """
-    seen = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, dtype=np.float64))
+    seen = cloud if isinstance(cloud, PointCloud) else PointCloud(np.asarray(cloud, float))
     everything = Reading.of_all(seen)
     if keep_all or len(seen) < MIN_POINTS:
         return (everything,)
@@ -401,11 +404,11 @@ def nearer_layer(points: Points, patch: Indices) -> Flags:
     A mask that is too wide lets in what is behind the object, which may be as many points as the object's own where it
     is thin.
     """
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     parts = [distance[patch == number] for number in np.flatnonzero(np.bincount(patch) >= MIN_POINTS)]
     ends = np.array([np.quantile(part, (0.05, 0.95)) for part in sorted(parts, key=np.median)]).reshape(-1, 2)
     near = np.maximum.accumulate(ends[:-1, 1])
     gaps = ends[1:, 0] - near
     if max(gaps, default=0.0) <= 0:
-        return np.ones(len(points), dtype=bool)
+        return np.ones(len(points), bool)
     return distance <= (near + gaps / 2)[gaps.argmax()]

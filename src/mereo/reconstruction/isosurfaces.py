@@ -12,19 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
+from numpy import ndarray
 
-from mereo.geometry.labels import LabelGrid, part_of_grid
+from mereo.geometry.conventions import GridShape
+from mereo.geometry.labels import GridLabels, LabelGrid, VoxelMask, part_of_grid
 from mereo.geometry.marching_cubes import CellFlags, changing_cells, nodes_of, on_both_sides, over_corners, zero_surface
-from mereo.geometry.mesh import AnyFaces, Color, Segment, SegmentedMesh
-from mereo.geometry.transforms import AnyPoints, Corners, Points, Rows, Vector, longest_side
+from mereo.geometry.mesh import EMPTY_MESH, AnyMesh, Color, Nested, Segment, SegmentedMesh
+from mereo.geometry.transforms import Corners, Points, Rows, Subset, Vector, longest_side
 
-GridLabels = UInt8[np.ndarray, "x y z"]
-"""Label of each node of a grid."""
-
-GridRows = Int[np.ndarray, "x y z"]
+GridRows = Int[ndarray, "x y z"]
 """Row of the logits of each node."""
 
-Logits = Float[np.ndarray, "m c"]
+Logits = Float[ndarray, "m c"]
 """Logits in rows."""
 
 # --- coarse to fine ---------------------------------------------------------------------------------------------------
@@ -73,10 +72,10 @@ class _Evaluator:
 
     def __init__(self, field: Field, origin: Vector, spacing: Vector) -> None:
         self.field, self.origin, self.spacing = field, origin, spacing
-        self.chunks: list[Logits] = []
+        self.chunks = list[Logits]()
         self.count = 0
 
-    def __call__(self, index: Int[np.ndarray, "m 3"]) -> tuple[UInt8[np.ndarray, " m"], Int[np.ndarray, " m"]]:
+    def __call__(self, index: Int[ndarray, "m 3"]) -> tuple[UInt8[ndarray, " m"], Subset]:
         """Labels and rows of nodes."""
         logits = self.field(self.origin + index * self.spacing)
         rows = np.arange(self.count, self.count + len(index), dtype=np.int32)
@@ -89,14 +88,14 @@ class _Evaluator:
         return np.concatenate(self.chunks)
 
 
-def sample_dense(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
+def sample_dense(field: Field, origin: Vector, spacing: Vector, shape: GridShape) -> Sampled:
     """Field evaluated at every node ``origin + [i, j, k] * spacing``."""
     evaluate = _Evaluator(field, origin, spacing)
     labels, rows = evaluate(_all_nodes(shape))
     return Sampled(labels.reshape(shape), rows.reshape(shape), evaluate.logits())
 
 
-def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: tuple[int, int, int]) -> Sampled:
+def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: GridShape) -> Sampled:
     """Labels of ``sample_dense`` from few evaluations; every cell with a change of label is known exactly."""
     evaluate = _Evaluator(field, origin, spacing)
     # whole coarse cells: up to three nodes beyond the grid are evaluated too and cut off at the end
@@ -117,7 +116,7 @@ def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: 
     return Sampled(labels[inside], rows[inside], evaluate.logits())
 
 
-def _all_nodes(shape: tuple[int, int, int]) -> Int[np.ndarray, "n 3"]:
+def _all_nodes(shape: GridShape) -> Int[ndarray, "n 3"]:
     return np.indices(shape).reshape(3, -1).T
 
 
@@ -126,7 +125,7 @@ def _sloping_cells(rows: GridRows, logits: Logits) -> CellFlags:
 
     For a field of signed distances this finds every cell that a surface passes, also of a ball between the nodes.
     """
-    lead = np.full(rows.shape, np.nan, dtype=logits.dtype)
+    lead = np.full(rows.shape, np.nan, logits.dtype)
     known = rows >= 0
     best = np.partition(logits[rows[known]], -2, axis=1)
     lead[known] = best[:, -1] - best[:, -2]
@@ -144,7 +143,7 @@ def _halve(
     active: CellFlags,
     step: int,
     evaluate: _Evaluator,
-) -> tuple[UInt8[np.ndarray, "u v w"], Int[np.ndarray, "u v w"]]:
+) -> tuple[UInt8[ndarray, "u v w"], Int[ndarray, "u v w"]]:
     """Labels and rows of the next lattice, ``step`` fine nodes apart.
 
     Active cells are evaluated, others filled with their corners' label. Then every skipped node next to one of another
@@ -154,7 +153,7 @@ def _halve(
     shape = tuple(2 * n - 1 for n in labels.shape)
     # a node between coarse nodes takes the one below: all corners of a cell that is not active agree
     fine_labels = labels[np.ix_(*(np.arange(n) // 2 for n in shape))]
-    fine_rows = np.full(shape, -1, dtype=np.int32)
+    fine_rows = np.full(shape, -1, np.int32)
     fine_rows[::2, ::2, ::2] = rows
     halves = active.repeat(2, axis=0).repeat(2, axis=1).repeat(2, axis=2)
     wanted = np.argwhere(nodes_of(halves) & (fine_rows < 0))
@@ -167,9 +166,7 @@ def _halve(
     return fine_labels, fine_rows
 
 
-def _contradicted(
-    labels: GridLabels, skipped: Bool[np.ndarray, "x y z"], news: Int[np.ndarray, "m 3"]
-) -> Bool[np.ndarray, "x y z"]:
+def _contradicted(labels: GridLabels, skipped: VoxelMask, news: Int[ndarray, "m 3"]) -> VoxelMask:
     """Skipped nodes that touch one of the nodes ``news`` with another label.
 
     The largest and smallest label among those it touches tell: two passes of bytes instead of 26 lists of indices.
@@ -178,11 +175,10 @@ def _contradicted(
     largest, smallest = np.zeros_like(labels), np.full_like(labels, 255)
     largest[place] = smallest[place] = labels[place]
     largest, smallest = _over_neighbors(largest, np.maximum), _over_neighbors(smallest, np.minimum)
-    contradicted: np.ndarray = skipped & ((largest > labels) | (smallest < labels))
-    return contradicted
+    return skipped & ((largest > labels) | (smallest < labels))
 
 
-def _over_neighbors(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
+def _over_neighbors(values: ndarray, combine: np.ufunc) -> ndarray:
     """Values of each node or cell and the 26 around it, joined by ``combine``."""
     for axis in range(3):
         grown = values.copy()
@@ -195,9 +191,6 @@ def _over_neighbors(values: np.ndarray, combine: np.ufunc) -> np.ndarray:
 
 
 # --- isosurfaces ------------------------------------------------------------------------------------------------------
-
-Nested = tuple[tuple[str, str], ...]
-"""Pairs of names (inner, outer), see ``SegmentedMesh``."""
 
 MAX_NODES = 80_000_000
 """Nodes that a grid may have."""
@@ -250,8 +243,7 @@ def extract(
     origin, spacing, shape = _grid(box, resolution)
     sampled = (sample_dense if dense else sample_coarse_to_fine)(field, origin, spacing, shape)
     grid = LabelGrid(sampled.labels, origin, spacing, tuple(names))
-    nothing = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
-    empty = SegmentedMesh(tuple(Segment(*named, *nothing) for named in zip(names, colors, strict=True)), nested)
+    empty = SegmentedMesh(tuple(Segment(*named, *EMPTY_MESH) for named in zip(names, colors, strict=True)), nested)
     surfaces = [
         _surface(sampled, grid, [index + 1, *(inner + 1 for inner, outer in empty.nesting if outer == index)])
         for index in range(len(names))
@@ -260,7 +252,7 @@ def extract(
     return Extraction(replace(empty, segments=tuple(segments)), grid, len(sampled.logits))
 
 
-def _grid(box: Corners, resolution: int) -> tuple[Vector, Vector, tuple[int, int, int]]:
+def _grid(box: Corners, resolution: int) -> tuple[Vector, Vector, GridShape]:
     """Origin, spacing and number of nodes of a grid, which may end up to one cell behind the box."""
     size = box[1] - box[0]
     if resolution < 4:
@@ -270,7 +262,7 @@ def _grid(box: Corners, resolution: int) -> tuple[Vector, Vector, tuple[int, int
     step = float(size.max()) / resolution
     x, y, z = (int(n) + 1 for n in np.ceil(size / step - 1e-6))
     check_nodes(resolution, x, y, z)
-    return box[0].astype(np.float64), np.full(3, step), (x, y, z)
+    return box[0].astype(float), np.full(3, step), (x, y, z)
 
 
 def check_nodes(resolution: int, x: int, y: int, z: int) -> None:
@@ -331,15 +323,15 @@ def _check_occupied(grid: LabelGrid) -> None:
         )
 
 
-def _grown(box: Corners, sides: Bool[np.ndarray, "2 3"], fraction: float) -> Corners:
+def _grown(box: Corners, sides: Bool[ndarray, "2 3"], fraction: float) -> Corners:
     step = fraction * longest_side(box)
     return box + step * sides * np.array([[-1.0], [1.0]])
 
 
-def _surface(sampled: Sampled, grid: LabelGrid, held: list[int]) -> tuple[AnyPoints, AnyFaces]:
+def _surface(sampled: Sampled, grid: LabelGrid, held: list[int]) -> AnyMesh:
     """Vertices and faces around ``held``, a label and those nested in it; none where the first does not occur."""
     if not (sampled.labels == held[0]).any():
-        return np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
+        return EMPTY_MESH
     occupied = np.argwhere(np.isin(sampled.labels, held))
     low = np.maximum(occupied.min(axis=0) - 1, 0)
     part = tuple(slice(a, b) for a, b in zip(low, occupied.max(axis=0) + 2, strict=True))
@@ -357,14 +349,14 @@ def _margin(
     rows: GridRows,
     logits: Logits,
     held: list[int],
-) -> Float[np.ndarray, "x y z"]:
+) -> Float[ndarray, "x y z"]:
     """Margin at each node: the largest logit of ``held`` less that of the others, its sign by the label.
 
     Where nothing was evaluated only the sign counts. A tie would put a vertex on a node, and marching cubes would make
     faces without area there; so ties are moved by a millionth.
     """
     known = rows >= 0
-    values = logits[rows[known]].astype(np.float64)
+    values = logits[rows[known]].astype(float)
     largest = values[:, held].max(axis=1)
     values[:, held] = -np.inf
     margin = np.where(np.isin(labels, held), 1.0, -1.0)

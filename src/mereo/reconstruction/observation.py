@@ -6,20 +6,32 @@ SensorFrame -find_object-> Observation (the object's points, and what each step 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
+from math import pi
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from numpy.linalg import inv, lstsq, norm, svd
+from numpy.random import default_rng
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import counted
-from mereo.geometry.camera import NOT_KNOWN, DepthImage, PointCloud, SharedNoise, SightKind, SightLines, into_camera
-from mereo.geometry.conventions import MIN_POINTS, CloudAxes
+from mereo.geometry.camera import (
+    NOT_KNOWN,
+    DepthImage,
+    PixelMask,
+    PixelValues,
+    PointCloud,
+    SharedNoise,
+    SightKind,
+    SightLines,
+    into_camera,
+)
+from mereo.geometry.conventions import MIN_POINTS, CloudAxes, Pair, Triple
 from mereo.geometry.downsampling import MAX_POINTS, STEEPEST, random_subset
 from mereo.geometry.surface_patches import noise_of_differences, second_differences
-from mereo.geometry.transforms import Points, Transform, longest_side, transform_points
+from mereo.geometry.transforms import Flags, Indices, Points, Transform, Values, longest_side, transform_points
+from mereo.io.atomic_files import JsonObject
 from mereo.io.sensor_frame import SensorFrame
 from mereo.reconstruction.config import Extent, IsolationConfig
 from mereo.reconstruction.isolation import (
@@ -84,7 +96,7 @@ class Observation:
     selection: Selection | None = None
     extent: Extent = "auto"
     initial_pose: Transform | None = None
-    point: tuple[int, int] | None = None
+    point: Pair | None = None
 
     @cached_property
     def lines(self) -> SightLines:
@@ -101,7 +113,7 @@ class Observation:
         """Phrase for where the object is looked for."""
         return "in this frame" if self.point is None else "at the point {} {}".format(*self.point)
 
-    def kept_pixels(self) -> Bool[np.ndarray, "h w"]:
+    def kept_pixels(self) -> PixelMask:
         """Measured pixels of the depth image that isolation keeps."""
         assert self.frame.depth is not None
         kept = self.frame.depth.valid.copy()
@@ -168,17 +180,17 @@ class Observation:
         return f"Observation({self.frame.source!r}, {points}, {size} {self.frame.length_name})"
 
     @property
-    def depth_m(self) -> tuple[float, float, float]:
+    def depth_m(self) -> Triple:
         """Nearest, middle and farthest depth of the object in metres, or in the frame's unit where it is not known."""
         return depths(self.cloud, self.frame.metres)
 
     @property
-    def size_m(self) -> tuple[float, float, float]:
+    def size_m(self) -> Triple:
         """Sides of the visible part's box in metres, or in the frame's unit where it is not known."""
         x, y, z = (np.ptp(self.cloud.points, axis=0) * self.frame.metres).tolist()
         return x, y, z
 
-    def facts(self) -> dict[str, Any]:
+    def facts(self) -> JsonObject:
         """Source, unit, depth, size and steps, dropped strays among them, for a result's summary.
 
         What is in metres is None where the unit is not known.
@@ -221,7 +233,7 @@ def main_length(points: Points) -> float:
     return longest_side(np.quantile(points, (0.01, 0.99), axis=0))
 
 
-def depths(cloud: PointCloud, factor: float) -> tuple[float, float, float]:
+def depths(cloud: PointCloud, factor: float) -> Triple:
     """Nearest, middle and farthest z of a cloud, times a factor."""
     near, middle, far = (np.quantile(cloud.points[:, 2], [0.0, 0.5, 1.0]) * factor).tolist()
     return near, middle, far
@@ -249,7 +261,7 @@ def find_object(
             f"the {len(cloud)} points of {frame.source} lie on a line or at one place; the object's surface must be "
             "seen: check the columns of the file, and what is cropped"
         )
-    extent: Extent = "surface" if isolation.extent == "auto" and is_surface(frame, cloud) else isolation.extent
+    extent = "surface" if isolation.extent == "auto" and is_surface(frame, cloud) else isolation.extent
     if extent == "surface":
         if frame.depth is not None:
             raise ValueError(
@@ -265,7 +277,7 @@ def _is_straight(points: Points) -> bool:
     """Whether enough points lie on a line or at one place; fewer are refused by that."""
     if len(points) < MIN_POINTS:
         return False
-    along, across, _ = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    along, across, _ = svd(points - points.mean(axis=0), compute_uv=False)
     return bool(across <= STRAIGHT * along)
 
 
@@ -308,7 +320,7 @@ def clusters_warning(observation: Observation) -> str | None:
     first, second = points[label == 0], points[label == 1]
     if len(second) < max(MIN_POINTS, LIKE_SIZE * len(first)):
         return None
-    gap, size = cKDTree(first).query(second)[0].min(), np.linalg.norm(np.ptp(second, axis=0))
+    gap, size = cKDTree(first).query(second)[0].min(), norm(np.ptp(second, axis=0))
     if gap < APART * size:
         return None
     metres, name = observation.frame.metres, observation.frame.length_name
@@ -348,9 +360,9 @@ def hidden_share(points: Points) -> float:
     points = random_subset(points, MAX_POINTS)
     if len(points) <= RING:
         return 0.0
-    distance = np.linalg.norm(points, axis=1)
+    distance = norm(points, axis=1)
     sight = points / np.maximum(distance, 1e-300)[:, None]
-    flat = sight @ np.linalg.svd(sight.mean(axis=0)[None])[2][1:].T
+    flat = sight @ svd(sight.mean(axis=0)[None])[2][1:].T
     probes = random_subset(np.arange(len(points)), PROBES)
     angle, ring = cKDTree(flat).query(flat[probes], k=RING + 1)
     ordered = np.sort(distance[ring], axis=1)
@@ -362,7 +374,7 @@ def hidden_share(points: Points) -> float:
     spread = (ordered - np.where(is_near, near, far)).std(axis=1, keepdims=True)
     pitch = np.median(angle[:, 4])  # the fourth neighbour of a pixel is one pitch away, as the first is
     is_behind = (distance[probes, None] > edge) & (gap > STEEPEST * pitch * edge) & (gap > STEP * spread)
-    turns = np.linspace(0, 2 * np.pi, RING, endpoint=False)
+    turns = np.linspace(0, 2 * pi, RING, endpoint=False)
     ahead = (flat[ring] - flat[probes, None]) @ np.stack([np.cos(turns), np.sin(turns)]) > 0
     is_closed = (ahead & (distance[ring] <= edge)[..., None]).any(axis=1).all(axis=1)
     return float((is_behind[:, 0] & is_closed).mean())
@@ -438,22 +450,22 @@ def lines_of_frame(frame: SensorFrame, selection: Selection | None, extent: Exte
     if extent in OTHER_LINES:
         return SightLines.of_cloud(OTHER_LINES[extent])
     points = frame.cloud.points
-    is_object = np.ones(len(points), dtype=bool) if selection is None else selection.of_object(points)
+    is_object = np.ones(len(points), bool) if selection is None else selection.of_object(points)
     if frame.depth is not None and frame.depth.valid.sum() == len(points):
-        shown = np.zeros(frame.depth.depth.shape, dtype=bool)
+        shown = np.zeros(frame.depth.depth.shape, bool)
         shown[frame.depth.valid] = is_object
         lines = lines_of_image(frame.depth if frame.whole is None else frame.whole, shown)
     else:
         T_camera_input = into_camera(points[is_object], frame.axes)
         lines = lines_of_points(transform_points(T_camera_input, points), is_object)
-        lines = lines.transformed(np.linalg.inv(T_camera_input))
+        lines = lines.transformed(inv(T_camera_input))
     return replace(lines, unknown=np.empty((0, 3)), other_lines="past") if extent == "whole" else lines
 
 
 # --- depth images ----------------------------------------------------------------------------------------------------
 
 
-def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLines:
+def lines_of_image(whole: DepthImage, shown: PixelMask) -> SightLines:
     """Lines of sight around the object in a depth image, in the camera frame and the image's unit.
 
     They are those of pixels within one size of the object around its box. Where hardly any of them met something, zeros
@@ -484,7 +496,7 @@ def lines_of_image(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SightLi
     return SightLines(places[met], places[~met], None if silent else "unknown", shared_noise(whole, shown))
 
 
-def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoise:
+def shared_noise(whole: DepthImage, shown: PixelMask) -> SharedNoise:
     """Measure the noise of a camera that neighbours share, at the distance of ``shown`` pixels.
 
     What the largest plane around them leaves over beyond the noise of single pixels, where it is about as far away;
@@ -497,7 +509,7 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoi
         return NOT_KNOWN
     distance = float(np.median(depth[shown & whole.valid]))
 
-    def terms(pixels: Int[np.ndarray, " n"]) -> Points:
+    def terms(pixels: Indices) -> Points:
         """What inverse depth is linear in along a plane."""
         return np.stack([pixels % width, pixels // width, np.full(len(pixels), width)], axis=1) / width
 
@@ -506,12 +518,12 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoi
     points = whole.camera.unproject(width * places[:, :2] + 0.5, 1.0 / inverse)
     focal_px = min(whole.camera.focal_x_px, whole.camera.focal_y_px)
     pixel = points[:, 2] / focal_px
-    plane = largest_plane(points, pixel, np.random.default_rng(0))
+    plane = largest_plane(points, pixel, default_rng(0))
     if plane is None:
         return NOT_KNOWN
     is_on = plane.distance(points) <= pixel
     for _ in range(FITS):
-        linear = np.linalg.lstsq(places[is_on], inverse[is_on])[0]
+        linear = lstsq(places[is_on], inverse[is_on])[0]
         off = inverse - places @ linear
         noise = float(np.sqrt(np.mean(off[is_on] ** 2)))
         is_on = np.abs(off) <= ON_PLANE * noise
@@ -529,13 +541,13 @@ def shared_noise(whole: DepthImage, shown: Bool[np.ndarray, "h w"]) -> SharedNoi
     left = flat.reshape(height, width)
     alone = noise_of_differences(second_differences(left, 1), second_differences(left.T, 1))
     places, inverse = terms(rows), 1.0 / flat[rows]
-    off = inverse - places @ np.linalg.lstsq(places, inverse)[0]
+    off = inverse - places @ lstsq(places, inverse)[0]
     shared = float(np.sqrt(max(np.mean(off**2) - alone**2, 0.0)))
     side = shared_side(field.reshape(height, width)) / focal_px
     return SharedNoise(shared * distance * max(distance, float(np.median(flat[rows]))), side, 1.0 / focal_px)
 
 
-def shared_side(noise: Float[np.ndarray, "h w"]) -> float:
+def shared_side(noise: PixelValues) -> float:
     """Side, in pixels, of a square of as many pixels as share an error; NaN is where none is known.
 
     That is the integral of the correlation, by its course along rows and columns, as far as it is not noise.
@@ -549,12 +561,10 @@ def shared_side(noise: Float[np.ndarray, "h w"]) -> float:
     alike = [(products[line] / np.maximum(pairs[line], 1.0))[1:most] for line in (np.s_[0], np.s_[:, 0])]
     together = np.mean(alike, axis=0)
     along = np.arange(1, 1 + int(np.argmax(np.append(together, -np.inf) < ALIKE * together[0])))
-    return float(np.sqrt(2 * np.pi * along @ together[: len(along)] / together[0]))
+    return float(np.sqrt(2 * pi * along @ together[: len(along)] / together[0]))
 
 
-def _evenly(
-    u: Int[np.ndarray, " n"], v: Int[np.ndarray, " n"], distance: Float[np.ndarray, " n"], limit: int
-) -> Bool[np.ndarray, " n"]:
+def _evenly(u: Indices, v: Indices, distance: Values, limit: int) -> Flags:
     """At most ``limit`` of some pixels: all near the object, farther off those of ever coarser grids.
 
     The pitch of the grid grows with the distance from the object, in pixels, but it is 1 up to ``DENSE``, even where
@@ -564,7 +574,7 @@ def _evenly(
     low, high = 0.0, float(octaves.max(initial=0.0))  # how many of them are dense
     kept = _on_grids(u, v, octaves)
     if len(u) <= limit or kept.sum() > limit:
-        return kept if len(u) > limit else np.ones(len(u), dtype=bool)
+        return kept if len(u) > limit else np.ones(len(u), bool)
     while high - low > 0.1:
         middle = 0.5 * (low + high)
         more = _on_grids(u, v, octaves - middle)
@@ -575,9 +585,7 @@ def _evenly(
     return kept
 
 
-def _on_grids(
-    u: Int[np.ndarray, " n"], v: Int[np.ndarray, " n"], octaves: Float[np.ndarray, " n"]
-) -> Bool[np.ndarray, " n"]:
+def _on_grids(u: Indices, v: Indices, octaves: Values) -> Flags:
     """Pixels of which both coordinates are multiples of 2^k, where k is ``octaves`` rounded up, and 0 at least."""
     between = (1 << np.maximum(np.ceil(octaves), 0.0).astype(np.int64)) - 1
     return (u | v) & between == 0
@@ -586,14 +594,14 @@ def _on_grids(
 # --- clouds ----------------------------------------------------------------------------------------------------------
 
 
-def lines_of_points(points: Points, is_object: Bool[np.ndarray, " n"]) -> SightLines:
+def lines_of_points(points: Points, is_object: Flags) -> SightLines:
     """Lines of sight to the points of a cloud that are not the object's; the rest is left open.
 
     Args:
         points: camera frame.
         is_object: which are the object's.
     """
-    ranges = np.linalg.norm(points, axis=1)
+    ranges = norm(points, axis=1)
     sight = points / np.maximum(ranges, 1e-300)[:, None]
     others = np.flatnonzero(~is_object & (points[:, 2] > 0))
     if len(others) == 0 or not is_object.any():
@@ -608,7 +616,7 @@ def lines_of_points(points: Points, is_object: Bool[np.ndarray, " n"]) -> SightL
     others, angle = others[is_free], angle[is_free]
     past = angle > RIM * pitch
     ahead = tree.data.mean(axis=0)
-    across = np.linalg.svd(ahead[None])[2][1:]
+    across = svd(ahead[None])[2][1:]
     u, v = np.floor((sight[others] - ahead) @ across.T / max(pitch, 1e-12)).astype(np.int64).T
     kept = _evenly(u, v, angle / max(pitch, 1e-12), MOST_LINES)
     return SightLines(points[others[past & kept]], points[others[~past & kept]])

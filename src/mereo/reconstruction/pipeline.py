@@ -12,30 +12,33 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 from scipy import ndimage
 from scipy.special import expit, logsumexp, softmax
 
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud, into_camera
-from mereo.geometry.conventions import CloudAxes
+from mereo.geometry.conventions import CloudAxes, Names
 from mereo.geometry.downsampling import random_subset
-from mereo.geometry.labels import LabelGrid, SegmentedCloud, part_of_grid
-from mereo.geometry.mesh import PALETTE, Color, SegmentedMesh
+from mereo.geometry.labels import LabelGrid, SegmentedCloud, VoxelMask, part_of_grid
+from mereo.geometry.mesh import PALETTE, SegmentColors, SegmentedMesh
 from mereo.geometry.solids import label_grid
 from mereo.geometry.transforms import Corners, Labels, Points, Rows, Transform, Vector, inverse_rigid, transform_points
 from mereo.models.calibration import Calibration
 from mereo.models.trained import EncodedCloud, Trained, checked_points
 from mereo.reconstruction.isolation import Reading
-from mereo.reconstruction.isosurfaces import Extraction, Field, extract_whole, locate
+from mereo.reconstruction.isosurfaces import Extraction, extract_whole, locate
 
 SEARCH_BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 2.5]])
 """Box in which segments are looked for first, normalized: the visible part fills [-1, 1], the hidden one is behind."""
 
 CONFIDENCE_VOXELS = 2000
 """Most voxels of a segment over which its confidence is a mean."""
+
+Seconds = dict[str, float]
+"""Seconds of each stage."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,9 +66,14 @@ class SegmentFacts:
     components: int
 
     def __repr__(self) -> str:
-        sure = "" if np.isnan(self.confidence) else f", confidence {self.confidence:.2f}"
-        figures = f"volume {self.volume:.3g}{sure}" if self.voxels else "not found"
-        return f"SegmentFacts({self.name!r}, {figures})"
+        return described(self, self.voxels > 0)
+
+
+def described(part: Any, is_present: bool) -> str:
+    """One line for a segment in figures: its name, and its volume and confidence where it was found."""
+    sure = "" if np.isnan(part.confidence) else f", confidence {part.confidence:.2f}"
+    figures = f"volume {part.volume:.3g}{sure}" if is_present else "not found"
+    return f"{type(part).__name__}({part.name!r}, {figures})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +99,7 @@ class Reconstruction:
     surfaces: SegmentedMesh
     labels: LabelGrid
     segments: tuple[SegmentFacts, ...]
-    timings_s: dict[str, float]
+    timings_s: Seconds
     evaluated: int
     clipped: bool
     code: EncodedCloud | None
@@ -106,7 +114,7 @@ class Reconstruction:
         low, high = surfaces.bounds
         counts = np.ceil((high - low) / spacing).astype(int) + 3  # with one empty voxel around
         corner = (low + high - (counts - 1) * spacing) / 2
-        grid = replace(self.labels, labels=np.zeros(counts, dtype=np.uint8), origin=corner)
+        grid = replace(self.labels, labels=np.zeros(counts, np.uint8), origin=corner)
         grid = replace(grid, labels=label_grid(surfaces, *grid.axes()))
         segments = tuple(
             replace(
@@ -156,7 +164,7 @@ class EncodedFrame:
     axes: CloudAxes
     T_camera_input: Transform
     code: EncodedCloud | None
-    timings_s: dict[str, float]
+    timings_s: Seconds
 
     @property
     def points(self) -> Points:
@@ -176,7 +184,7 @@ def encode_frame(reading: Reading, model: Trained | None, axes: CloudAxes = "cam
     """
     points = reading.cloud.points
     T_camera_input = into_camera(points, axes)
-    seconds: dict[str, float] = {}
+    seconds = Seconds()
     seen = reading.cloud.transformed(T_camera_input)
     if model is None:
         checked_points(seen)
@@ -200,7 +208,7 @@ def extract(seen: EncodedFrame, model: Trained, resolution: int = 128, label_poi
     names, colors = segment_names(model)
     seconds, code = dict(seen.timings_s), seen.code
     assert code is not None
-    field: Field = partial(model.logits, code)
+    field = partial(model.logits, code)
     with timed(seconds, "locate"):
         box = locate(field, code.normalizer.invert(SEARCH_BOX))
     with timed(seconds, "extract"):
@@ -228,14 +236,14 @@ def extract(seen: EncodedFrame, model: Trained, resolution: int = 128, label_poi
 
 
 @contextmanager
-def timed(timings: dict[str, float], stage: str) -> Iterator[None]:
+def timed(timings: Seconds, stage: str) -> Iterator[None]:
     """Add the seconds of a block to ``timings`` under the name of its stage."""
     start = time.perf_counter()
     yield
     timings[stage] = time.perf_counter() - start
 
 
-def segment_names(model: Trained) -> tuple[tuple[str, ...], tuple[Color, ...]]:
+def segment_names(model: Trained) -> tuple[Names, SegmentColors]:
     """Names and colours of the classes that the model tells apart; one trained on distances knows only the whole."""
     return (model.names, model.colors) if model.segmented else (("object",), PALETTE[:1])
 
@@ -268,8 +276,8 @@ def turned_back(result: Reconstruction) -> Reconstruction:
 def segment_points(
     logits: Rows,
     points: Points,
-    names: tuple[str, ...],
-    colors: tuple[Color, ...],
+    names: Names,
+    colors: SegmentColors,
     calibration: Calibration | None = None,
     labels: Labels | None = None,
 ) -> SegmentedCloud:
@@ -289,7 +297,7 @@ def segment_points(
         from mereo.models.model import scaled_array
 
         scaled = scaled_array(calibration.scaling, logits)
-    parts = scaled[:, 1:].astype(np.float64)
+    parts = scaled[:, 1:].astype(float)
     return SegmentedCloud(
         points=points,
         labels=labels,
@@ -304,7 +312,7 @@ SPECK = 0.1
 """Length of a group of voxels, as a share of the longest one's, below which a person sees a speck and not a part."""
 
 
-def count_parts(voxels: Bool[np.ndarray, "x y z"]) -> int:
+def count_parts(voxels: VoxelMask) -> int:
     """Number of parts that voxels are in: groups that touch at faces, edges or corners, without the specks among them.
 
     A group is as long as the longest side of the box around its voxels' centres, so that a single voxel has no length.

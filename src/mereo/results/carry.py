@@ -9,12 +9,14 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Int, Shaped, UInt8
+from jaxtyping import Float, Int, Shaped
+from numpy import ndarray
 from numpy.linalg import det, inv, norm
 from scipy.ndimage import map_coordinates
 
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
+from mereo.geometry.labels import GridLabels, VoxelMask
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, label_grid
 from mereo.geometry.subdivision import split_long_edges
@@ -24,10 +26,12 @@ from mereo.geometry.transforms import (
     Matrices,
     PointArray,
     Points,
+    Subset,
     Transform,
     Values,
     Vector,
     best_rotations,
+    box_of,
     transform_points,
 )
 from mereo.io.attachments import Attachment, Content, Surfaces, turned_attachment
@@ -36,7 +40,7 @@ from mereo.io.config import CarryFrame
 from mereo.io.volume_files import Volume, is_labels
 from mereo.scenes.statistical_model import StatisticalModel
 
-SegmentShares = Float[np.ndarray, "n s"]
+SegmentShares = Float[ndarray, "n s"]
 """Share of each segment in the motion of each point."""
 
 Interpolation = Literal["linear", "nearest"]
@@ -201,9 +205,7 @@ def check_overlap(name: str, volume: Volume, T_scene_file: Transform, model: Sta
     boxes = []
     for bounds in (volume.bounds, model.rest.bounds):
         corners = transform_points(inv(T_scene_file), np.array(list(product(*bounds.T))))
-        boxes.append(
-            " to ".join(str(corner.round(2).tolist()) for corner in (corners.min(axis=0), corners.max(axis=0)))
-        )
+        boxes.append(" to ".join(str(corner.round(2).tolist()) for corner in box_of(corners)))
     raise ValueError(
         f"{name} holds nothing of the object: in RAS its voxels lie from {boxes[0]}, and the object's own files "
         f"from {boxes[1]}; both must have one frame and unit: export the volume in that of the object's own "
@@ -251,7 +253,7 @@ def moved(registration: Registration, points: Points, shares: SegmentShares) -> 
     for index, share in enumerate(shares.T):
         rows = np.flatnonzero(share > 0)
         if len(rows):
-            labels = np.full(len(rows), index + 1, dtype=np.uint8)
+            labels = np.full(len(rows), index + 1, np.uint8)
             result[rows] += share[rows, None] * registration.to_camera(points[rows], labels)
     return result
 
@@ -333,7 +335,7 @@ class _Fill:
     origin: Vector
     spacing: float
     background: float | int
-    values: Shaped[np.ndarray, "x y z"]
+    values: Shaped[ndarray, "x y z"]
 
     @classmethod
     def around(cls, source: Volume, registration: Registration, interpolation: Interpolation, most: int) -> "_Fill":
@@ -348,10 +350,10 @@ class _Fill:
             spacing *= max((count / most) ** (1 / 3), 1.01)
         origin = bounds.mean(axis=0) - (cell * cells - 1) * spacing / 2
         background = (source.values.max() if source.slope < 0 else source.values.min()).item()
-        values = np.full(cell * cells, background, dtype=source.values.dtype)
+        values = np.full(cell * cells, background, source.values.dtype)
         return cls(source, registration, interpolation, margin, origin, spacing, background, values)
 
-    def at(self, index: Shaped[np.ndarray, "*n 3"]) -> PointArray:
+    def at(self, index: Shaped[ndarray, "*n 3"]) -> PointArray:
         """Positions of voxel indices, which may have fractions."""
         return self.origin + self.spacing * index
 
@@ -359,14 +361,14 @@ class _Fill:
         """Positions of voxels by their rows in the flattened grid."""
         return self.at(np.stack(np.unravel_index(rows, self.values.shape), axis=1))
 
-    def owners(self) -> tuple[UInt8[np.ndarray, "x y z"], Bool[np.ndarray, "x y z"]]:
+    def owners(self) -> tuple[GridLabels, VoxelMask]:
         """Label of the segment that each voxel moves along with, 0 beyond the margin, and whether it is inside it."""
         shape, solids = self.values.shape, self.registration.solids
         x, y, z = (self.origin[axis] + self.spacing * np.arange(shape[axis]) for axis in range(3))
         owner = label_grid(solids.mesh, x, y, z)
         inside = owner > 0
         side = CELLS[0]
-        cells = np.argwhere(np.ones([n // side for n in shape], dtype=bool))
+        cells = np.argwhere(np.ones([n // side for n in shape], bool))
         reach = self.margin + np.sqrt(3) / 2 * side * self.spacing
         near = cells[solids.nearest(self.at(side * cells + (side - 1) / 2)).distance <= reach]
         rows = _flat(side * near[:, None] + _offsets(side), shape).ravel()
@@ -376,7 +378,7 @@ class _Fill:
             owner.reshape(-1)[rows[part]] = np.where(nearest.distance <= self.margin, nearest.owner + 1, 0)
         return owner, inside
 
-    def segment(self, label: int, todo: Bool[np.ndarray, "x y z"], inside: Bool[np.ndarray, "x y z"]) -> int:
+    def segment(self, label: int, todo: VoxelMask, inside: VoxelMask) -> int:
         """Fill one segment's voxels, ``todo``; returns how many of them inside the object were within the source."""
         open_, inside_, held, shape = todo.reshape(-1), inside.reshape(-1), 0, self.values.shape
         for side in CELLS:
@@ -396,22 +398,20 @@ class _Fill:
             held += int(inside_[self._put(left[part], index)].sum())
         return held
 
-    def _put(self, rows: Indices, index: Points) -> Int[np.ndarray, " m"]:
+    def _put(self, rows: Indices, index: Points) -> Subset:
         """Fill voxels with the source's values at indices with fractions; returns those that it holds."""
         source, held = self.source.values, self.source.holds(index)
         if self.interpolation == "nearest":
             nearest = np.clip(np.rint(index).astype(np.int64), 0, np.array(source.shape) - 1)
             sampled = source[tuple(nearest.T)]
         else:
-            smooth = map_coordinates(source, index.T, order=1, mode="nearest", output=np.float64)
+            smooth = map_coordinates(source, index.T, order=1, mode="nearest", output=float)
             sampled = (np.rint(smooth) if source.dtype.kind in "iu" else smooth).astype(source.dtype)
         sampled[~held] = self.background
         self.values.reshape(-1)[rows] = sampled
         return rows[held]
 
-    def _corners(
-        self, cells: Int[np.ndarray, "n 3"], side: int, label: int
-    ) -> tuple[Float[np.ndarray, "n 8 3"], Flags]:
+    def _corners(self, cells: Int[ndarray, "n 3"], side: int, label: int) -> tuple[Float[ndarray, "n 8 3"], Flags]:
         """Indices in the source of cells' corners, and whether they may be interpolated, by the cells' centres."""
         shape = [n // side + 1 for n in self.values.shape]
         nodes, row = np.unique(_flat(cells[:, None] + CUBE, shape), return_inverse=True)
@@ -422,7 +422,7 @@ class _Fill:
 
     def _source_index(self, points: Points, label: int) -> Points:
         """Voxel indices, with fractions, of where points that move along with a segment were at rest."""
-        rest, labels = np.empty_like(points), np.full(len(points), label, dtype=np.uint8)
+        rest, labels = np.empty_like(points), np.full(len(points), label, np.uint8)
         for part in _parts(len(points), QUERIES_AT_ONCE):
             rest[part] = self.registration.to_rest(points[part], labels[part])
         return self.source.index_of(rest)
@@ -432,11 +432,11 @@ def _parts(count: int, most: int) -> Iterator[slice]:
     return (slice(first, first + most) for first in range(0, count, most))
 
 
-def _offsets(side: int) -> Int[np.ndarray, "v 3"]:
+def _offsets(side: int) -> Int[ndarray, "v 3"]:
     """Voxels of a cell, from its first."""
-    return np.argwhere(np.ones((side, side, side), dtype=bool))
+    return np.argwhere(np.ones((side, side, side), bool))
 
 
-def _flat(index: Int[np.ndarray, "*n 3"], shape: Sequence[int]) -> Int[np.ndarray, "*n"]:
+def _flat(index: Int[ndarray, "*n 3"], shape: Sequence[int]) -> Int[ndarray, "*n"]:
     """Rows in the flattened array."""
     return np.ravel_multi_index(tuple(np.moveaxis(index, -1, 0)), tuple(shape))

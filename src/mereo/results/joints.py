@@ -8,11 +8,13 @@ uncertainty is known.
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from math import inf, pi
 from typing import Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.linalg import inv, norm
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.special import chdtri, ndtr
@@ -28,7 +30,7 @@ from mereo.geometry.transforms import Indices, fit_rigid, transform_points
 from mereo.io.atomic_files import JsonObject
 from mereo.scenes.scene import AssetUnavailable, Scene
 
-SHOWN = {"rad": (180 / np.pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
+SHOWN = {"rad": (180 / pi, "°"), "m": (1000.0, " mm"), "": (1.0, " units")}
 """Factor and name of the units in which people read values."""
 
 
@@ -68,7 +70,11 @@ class JointValue:
         return asdict(self)
 
 
-def measure_joints(answer: Answer) -> dict[str, JointValue]:
+JointValues = dict[str, JointValue]
+"""Values by the names of joints."""
+
+
+def measure_joints(answer: Answer) -> JointValues:
     """Measure the joints that have names in the object's definition, by which they are counted, in an answer's state.
 
     Empty where there are none, and where the network answers. Those of a registration are measured once.
@@ -82,10 +88,10 @@ def measure_joints(answer: Answer) -> dict[str, JointValue]:
     return _MEASURED.get(fitted, {})
 
 
-_MEASURED = WeakKeyDictionary[Registration, dict[str, JointValue]]()
+_MEASURED = WeakKeyDictionary[Registration, JointValues]()
 
 
-def _measured(registration: Registration, scene: Scene | None) -> dict[str, JointValue]:
+def _measured(registration: Registration, scene: Scene | None) -> JointValues:
     motion = None if scene is None else scene.sample_deformations
     if scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
         return {}
@@ -93,7 +99,7 @@ def _measured(registration: Registration, scene: Scene | None) -> dict[str, Join
     rows = np.unique(np.concatenate([anchors[:: 1 + len(anchors) // 64] for anchors in registration.model.anchors]))
     fit = _fit_shares(registration, motion, leaders, rows)
     reach = _reach(registration, fit, rows)
-    values = dict[str, JointValue]()
+    values = JointValues()
     for name, (joint, _) in motion.joints.items():
         index = leaders.index(joint.follows or name)
         leader = motion.joints[leaders[index]][0]
@@ -103,9 +109,9 @@ def _measured(registration: Registration, scene: Scene | None) -> dict[str, Join
         value = ends[0] + float(fit.x[index]) * (ends[1] - ends[0])
         off = None if reach is None else abs(ends[1] - ends[0]) * float(reach[index])
         if joint.turns:  # a whole turn more is the same state
-            turn = 2 * np.pi * float(np.round((value - (first + second) / 2) / (2 * np.pi)))
+            turn = 2 * pi * float(np.round((value - (first + second) / 2) / (2 * pi)))
             value, ends = value - turn, [end - turn for end in ends]
-        low, high = (-np.inf, np.inf) if leader.shares == WHOLE else sorted(ends)
+        low, high = (-inf, inf) if leader.shares == WHOLE else sorted(ends)
         interval = None if off is None else (max(value - off, low), min(value + off, high))
         values[name] = JointValue(value, interval, unit, (min(first, second), max(first, second)))  # type: ignore[arg-type]
     return values
@@ -124,7 +130,7 @@ def _fit_shares(
     joints = [motion.joints[name][0] for name in leaders]
     least, most = np.transpose([joint.shares for joint in joints])
 
-    def misfit(numbers: Float[np.ndarray, " j"]) -> Float[np.ndarray, " r"]:
+    def misfit(numbers: Float[ndarray, " j"]) -> Float[ndarray, " r"]:
         moved, shares = np.empty_like(rest), least + numbers * (most - least)
         for label, deform in enumerate(motion.at(dict(zip(leaders, shares.tolist(), strict=True))), start=1):
             moved[labels == label] = deform(rest[labels == label])
@@ -134,12 +140,12 @@ def _fit_shares(
     starts = [np.full(len(leaders), 0.5), (at_rest - least) / np.maximum(most - least, 1e-9)]  # the middle, and rest
     if drawn is not None and len(drawn.z) == len(leaders):
         starts = [ndtr(drawn.z)]
-    free = np.where([joint.shares == WHOLE for joint in joints], np.inf, 0.0)
+    free = np.where([joint.shares == WHOLE for joint in joints], inf, 0.0)
     fits = (least_squares(misfit, np.clip(start, -free, 1 + free), bounds=(-free, 1 + free)) for start in starts)
     return min(fits, key=lambda fit: float(fit.cost))
 
 
-def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Float[np.ndarray, " j"] | None:
+def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Float[ndarray, " j"] | None:
     """How far off shares may be with probability 0.95; None where the uncertainty of the points is not known.
 
     The parts are those of a radius (``RadiusParts``), without what each point has in addition: it averages out.
@@ -152,7 +158,7 @@ def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Fl
     return np.abs(ways).max(axis=1, initial=0.0) + WITHIN * norm(gaussian, axis=1)
 
 
-def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | None:
+def pose_covariance(registration: Registration) -> Float[ndarray, "6 6"] | None:
     """Covariance of ``Registration.pose``; None where the uncertainty of the points is not known.
 
     Of a rotation vector w in radians, then a translation t in the input's unit, both in the axes of the registration:
@@ -179,8 +185,8 @@ def pose_covariance(registration: Registration) -> Float[np.ndarray, "6 6"] | No
 
 
 def _moves(
-    registration: Registration, gradient: Float[np.ndarray, "c m 3"]
-) -> tuple[Float[np.ndarray, "c p"], Float[np.ndarray, "c o"]] | None:
+    registration: Registration, gradient: Float[ndarray, "c m 3"]
+) -> tuple[Float[ndarray, "c p"], Float[ndarray, "c o"]] | None:
     """How c numbers, of which the gradient by the material points is given, are unsure; None where points are not.
 
     Their changes with independent standard normal numbers, and in each other state that explains the frame alike.

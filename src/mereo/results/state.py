@@ -45,7 +45,11 @@ WITNESSES = 8
 """Number of material points whose positions are in the file."""
 
 
-def _rigid(rows: tuple[tuple[float, ...], ...]) -> tuple[tuple[float, ...], ...]:
+Rounded = tuple[tuple[float, ...], ...]
+"""Rows of numbers as a file has them."""
+
+
+def _rigid(rows: Rounded) -> Rounded:
     if not is_rigid(np.array(rows)):
         raise ValueError("must be a rigid transform: a rotation, a translation, and 0 0 0 1 below")
     return rows
@@ -147,7 +151,7 @@ def model_digest(model: StatisticalModel) -> str:
     vertices, faces, _ = model.rest.merged()
     for values in (vertices, faces, model.nodes, model.node_labels, model.mean, model.modes):
         digest.update(f"{values.shape}".encode())
-        digest.update(np.ascontiguousarray(values, dtype=values.dtype.newbyteorder("<")).tobytes())
+        digest.update(np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes())
     return digest.hexdigest()
 
 
@@ -248,7 +252,7 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
             f"the state belongs to the statistical model of other weights (scene {state.scene!r}, weights "
             f"{state.weights!r}); its numbers mean nothing here: give the model of those weights"
         )
-    z, drawn = np.array(state.z, dtype=np.float64), None
+    z, drawn = np.array(state.z, float), None
     if state.draws is None:
         if len(z) != model.count:
             raise ValueError(
@@ -295,5 +299,5 @@ def _witnesses(model: StatisticalModel) -> Int[np.ndarray, " w"]:
     return np.linspace(0, len(model.mean) - 1, WITNESSES).astype(np.int64)
 
 
-def _rows(values: Rows) -> tuple[tuple[float, ...], ...]:
+def _rows(values: Rows) -> Rounded:
     return tuple(map(tuple, values.tolist()))

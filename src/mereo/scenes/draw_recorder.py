@@ -10,14 +10,18 @@ import sys
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import inf
 from types import CodeType, FrameType
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import default_rng
 from scipy.special import ndtri
 
 from mereo.deformation.draw_names import DrawName, NamedGenerator
+from mereo.geometry.conventions import WholeNumbers
 
 Trail = tuple[tuple[CodeType, int], ...]
 """The calls that led to a draw, outermost first: code, and the instruction within it."""
@@ -28,7 +32,7 @@ Place = tuple[tuple[tuple[str, int, int], ...], DrawName]
 Key = tuple[Place, int]
 """Which draw it is: its place, and how many draws there were from the same place before it."""
 
-Shares = Float[np.ndarray, " n"]
+Shares = Float[ndarray, " n"]
 
 SMOOTH = ("uniform", "normal", "triangular")
 """Kinds of draws between whose values there is a way: they move the state continuously. The others stay as they are."""
@@ -63,8 +67,8 @@ class Call:
     shares: Shares
     low: Shares
     high: Shares
-    shape: tuple[int, ...]
-    ends: Float[np.ndarray, " o"] | None = None
+    shape: WholeNumbers
+    ends: Float[ndarray, " o"] | None = None
 
 
 class Recorder(NamedGenerator):
@@ -77,16 +81,16 @@ class Recorder(NamedGenerator):
     def __init__(self, seed: int, given: Mapping[Key, Shares], most: int | None = None) -> None:
         """Recorder of one run; ``most`` is the largest number of calls before ``OutOfDraws``."""
         super().__init__(np.random.PCG64([seed, 1]))
-        self.calls: list[Call] = []
+        self.calls = list[Call]()
         self._given, self._most = given, most
-        self._fresh = np.random.default_rng([seed, 0])
-        self._seen: Counter[Place] = Counter()
+        self._fresh = default_rng([seed, 0])
+        self._seen = Counter[Place]()
         self._ends: Any = None
 
     def __reduce__(self) -> Any:
         raise TypeError("a Recorder belongs to one run of a scene and cannot be copied")
 
-    def _take(self, kind: str, shape: tuple[int, ...], low: Any, high: Any) -> Shares:
+    def _take(self, kind: str, shape: WholeNumbers, low: Any, high: Any) -> Shares:
         if self._most is not None and len(self.calls) >= self._most:
             raise OutOfDraws
         trail, name = _trail(), self.take_name()
@@ -96,7 +100,7 @@ class Recorder(NamedGenerator):
         self._seen[place] += 1
         size = int(np.prod(shape))
         shares = np.clip(self._chosen(key, size), SMALLEST_SHARE, 1 - SMALLEST_SHARE)
-        bounds = [np.broadcast_to(np.asarray(bound, dtype=float), shape).ravel() for bound in (low, high)]
+        bounds = [np.broadcast_to(np.asarray(bound, float), shape).ravel() for bound in (low, high)]
         self.calls.append(Call(key, trail, name, kind, shares, bounds[0], bounds[1], shape, self._ends))
         self._ends = None
         return shares
@@ -112,7 +116,7 @@ class Recorder(NamedGenerator):
         # numpy takes the bounds in either order; a share counts from the lower one, as a slider does
         low, high = np.minimum(low, high), np.maximum(low, high)
         shares = self._take("uniform", shape, low, high).reshape(shape)
-        return _plain(np.asarray(low, dtype=float) + shares * (np.asarray(high, dtype=float) - low))
+        return _plain(np.asarray(low, float) + shares * (np.asarray(high, float) - low))
 
     def random(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """Uniform numbers in 0..1; recorded, unless they are drawn into ``out``."""
@@ -123,7 +127,7 @@ class Recorder(NamedGenerator):
     def normal(self, loc: Any = 0.0, scale: Any = 1.0, size: Any = None) -> Any:
         """Normal numbers of mean ``loc`` and standard deviation ``scale``; recorded."""
         shape = _shape(size, loc, scale)
-        return _plain(loc + scale * ndtri(self._take("normal", shape, -np.inf, np.inf)).reshape(shape))
+        return _plain(loc + scale * ndtri(self._take("normal", shape, -inf, inf)).reshape(shape))
 
     def standard_normal(self, size: Any = None, dtype: Any = np.float64, out: Any = None) -> Any:
         """Standard normal numbers; recorded, unless they are drawn into ``out``."""
@@ -135,7 +139,7 @@ class Recorder(NamedGenerator):
         """Numbers of the triangular distribution; recorded."""
         shape = _shape(size, left, mode, right)
         shares = self._take("triangular", shape, left, right).reshape(shape)
-        left, mode, right = (np.asarray(value, dtype=float) for value in (left, mode, right))
+        left, mode, right = (np.asarray(value, float) for value in (left, mode, right))
         rising = left + np.sqrt(shares * (right - left) * (mode - left))
         falling = right - np.sqrt((1 - shares) * (right - left) * (right - mode))
         return _plain(np.where(shares * (right - left) < mode - left, rising, falling))
@@ -170,13 +174,13 @@ class Recorder(NamedGenerator):
         return np.take(items, order, axis=axis)
 
 
-def _shape(size: Any, *parameters: Any) -> tuple[int, ...]:
+def _shape(size: Any, *parameters: Any) -> WholeNumbers:
     if size is None:
         return np.broadcast_shapes(*(np.shape(p) for p in parameters))
     return (int(size),) if np.ndim(size) == 0 else tuple(int(n) for n in size)
 
 
-def _options(given: Any) -> np.ndarray:
+def _options(given: Any) -> ndarray:
     """What numpy's generators choose from: an array, or the numbers below one."""
     return np.arange(given) if np.ndim(given) == 0 else np.asarray(given)
 
@@ -192,7 +196,7 @@ def _trail() -> Trail:
     Without the recorder's own steps, and those of the tests' shape checks around every function.
     """
     frame: FrameType | None = sys._getframe(1)
-    trail: list[tuple[CodeType, int]] = []
+    trail = list[tuple[CodeType, int]]()
     while frame is not None and frame.f_code.co_name != "play":
         code, file = frame.f_code, frame.f_code.co_filename
         if file != __file__ and not file.startswith("<@") and "jaxtyping" not in file:

@@ -11,17 +11,20 @@ from collections import Counter
 from collections.abc import Mapping, Sequence, Sized
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from math import pi
 from pathlib import Path
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
+from numpy.random import default_rng
 from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformations
 from mereo.deformation.samplers import JointSampler, RandomMotion
-from mereo.geometry.conventions import Names, Range
+from mereo.geometry.conventions import Names, Pair, Range
 from mereo.io.bounds import NotNegative, Number, check_value
 from mereo.io.errors import AnyPath
 from mereo.io.yaml_document import Document
@@ -39,6 +42,10 @@ RETRIES = 10
 
 WITNESSES = 40
 """Vertices of each segment whose motion tells whether two states are the same."""
+
+
+Given = Mapping[Key, Shares]
+"""Shares of draws that are known."""
 
 
 class Refused(ValueError):
@@ -60,7 +67,7 @@ class Played:
     seed: int
     calls: tuple[Call, ...]
     deformations: Deformations
-    remembered: Mapping[Key, Shares]
+    remembered: Given
     turns: Mapping[Key, tuple[float, Shares]]
 
     @property
@@ -111,7 +118,7 @@ def _played_by(scene: Scene, seed: int, recorder: Recorder) -> Played | None:
     return Played(seed, calls, deformations, {call.key: call.shares for call in calls}, {})
 
 
-def replayed(scene: Scene, seed: int, given: Mapping[Key, Shares]) -> Played | None:
+def replayed(scene: Scene, seed: int, given: Given) -> Played | None:
     """State by the shares of its draws, in their order; None where the scene refuses them, or draws others."""
     played = _played_by(scene, seed, Recorder(seed, given, len(given)))
     return played if played is not None and list(played.keys) == list(given) else None
@@ -120,7 +127,7 @@ def replayed(scene: Scene, seed: int, given: Mapping[Key, Shares]) -> Played | N
 def _played(
     scene: Scene,
     seed: int,
-    given: Mapping[Key, Shares],
+    given: Given,
     turns: Mapping[Key, tuple[float, Shares]],
     before: Played | None,
 ) -> Played:
@@ -136,7 +143,7 @@ def _played(
 
 def _renumbered(calls: Sequence[Call]) -> tuple[Call, ...]:
     """Calls with keys counted again where calls were left out."""
-    seen: Counter[Place] = Counter()
+    seen = Counter[Place]()
     result = []
     for call in calls:
         place = call.key[0]
@@ -165,7 +172,7 @@ def _without_refused(scene: Scene, seed: int, calls: tuple[Call, ...], deformati
     return calls
 
 
-def _witness(scene: Scene, deformations: Deformations) -> Float[np.ndarray, "w 3"]:
+def _witness(scene: Scene, deformations: Deformations) -> Float[ndarray, "w 3"]:
     """Where a few vertices of each segment go."""
     return np.concatenate(
         [
@@ -180,9 +187,9 @@ def _witness(scene: Scene, deformations: Deformations) -> Float[np.ndarray, "w 3
 
 def parameters(played: Played) -> tuple[Parameter, ...]:
     """Degrees of freedom of this state, in the order in which they are drawn, with names that differ in a group."""
-    sliders: list[Parameter] = []
+    sliders = list[Parameter]()
     titles = [_title(call) for call in played.calls]
-    seen: Counter[tuple[str, Names]] = Counter()
+    seen = Counter[tuple[str, Names]]()
     for call, (group, names) in zip(played.calls, titles, strict=True):
         seen[group, names] += 1
         if titles.count((group, names)) > 1:
@@ -230,7 +237,7 @@ def _parameter(call: Call, index: int, group: str, name: str) -> Parameter:
         if call.ends is not None:
             value = np.minimum(np.searchsorted(call.ends, share, side="right"), high - 1)
         return Parameter(call.key, index, group, name, "", low, high - 1, float(value), whole=True)
-    factor, unit = (180 / np.pi, "°") if call.name.unit == "rad" else (1.0, call.name.unit)
+    factor, unit = (180 / pi, "°") if call.name.unit == "rad" else (1.0, call.name.unit)
     low, high = low * factor, high * factor
     return Parameter(call.key, index, group, name, unit, low, high, low + share * (high - low))
 
@@ -262,14 +269,14 @@ def set_value(scene: Scene, played: Played, parameter: Parameter, value: float) 
     )
 
 
-def turned(shares: Shares, turn: float, seed: int | tuple[int, int]) -> Shares:
+def turned(shares: Shares, turn: float, seed: int | Pair) -> Shares:
     """Shares of many numbers moved at once, so that they stay as random as they were.
 
     As normal numbers z they go round a circle through other ones w: z cos + w sin has the same distribution everywhere
     on it (elliptical slice sampling, Murray et al., AISTATS 2010, walks on the same curve). 0 and 1 are the start.
     """
-    other = np.random.default_rng(seed).normal(size=len(shares))
-    angle = 2 * np.pi * turn
+    other = default_rng(seed).normal(size=len(shares))
+    angle = 2 * pi * turn
     return ndtr(np.cos(angle) * ndtri(shares) + np.sin(angle) * other)
 
 
@@ -293,7 +300,7 @@ def _share(call: Call, parameter: Parameter, value: float) -> float:
 class _InOrder(Recorder):
     """Recorder that is given its draws in the order of the calls; more or other ones raise ``OutOfDraws``."""
 
-    def __init__(self, seed: int, shares: Sequence[np.ndarray]) -> None:
+    def __init__(self, seed: int, shares: Sequence[ndarray]) -> None:
         super().__init__(seed, {})
         self._shares = shares
 
@@ -304,15 +311,13 @@ class _InOrder(Recorder):
         return self._shares[number]
 
 
-def played_back(
-    scene: Scene, seed: int, shares: Sequence[np.ndarray], cure: str = "register the frame again"
-) -> Played:
-    """State of a scene by the shares of each call; raises ``Refused``, with a ``cure``, where it does not take them."""
+def played_back(scene: Scene, seed: int, shares: Sequence[ndarray]) -> Played:
+    """State of a scene by the shares of each call; raises ``Refused`` where it does not take them."""
     played = _played_by(scene, seed, _InOrder(seed, shares))
     if played is None:
         raise Refused(
             f"the scene {scene.name!r} does not take these {len(shares)} draws; they are of another scene, or of "
-            f"another version of it: {cure}"
+            "another version of it: register the frame again"
         )
     return played
 
@@ -407,7 +412,7 @@ def _values(given: Any, names: list[str]) -> dict[str, Range]:
 
 def _shares(joint: JointSampler, value: float, within: float, unit_m: float) -> Range:
     """Least and greatest share of a joint's range by its value in radians or metres."""
-    unit, turn, name = (1.0, 2 * np.pi, "rad") if joint.turns else (unit_m, np.inf, "m")
+    unit, turn, name = (1.0, 2 * pi, "rad") if joint.turns else (unit_m, np.inf, "m")
     first, second = (unit * limit for limit in joint.limits)
     if joint.turns:  # a whole turn more is the same state
         value -= turn * round((value - (first + second) / 2) / turn)

@@ -9,6 +9,9 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
+from numpy import ndarray
+from numpy.linalg import eigh
+from numpy.random import default_rng
 
 from mereo.deformation.elastic import ElasticSampler, elastic_motion
 from mereo.deformation.maps import moved_by
@@ -23,6 +26,7 @@ from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene, State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import (
+    MaterialPoints,
     PairDistances,
     StatisticalModel,
     kept_distances,
@@ -32,13 +36,13 @@ from mereo.scenes.statistical_model import (
     statistical_model_bytes,
 )
 
-Nodes = Float[np.ndarray, "j 3"]
+Nodes = Float[ndarray, "j 3"]
 """Positions of the interior nodes, in rows."""
 
-NodeLabels = UInt8[np.ndarray, " j"]
+NodeLabels = UInt8[ndarray, " j"]
 """Label of the segment of each."""
 
-StatePoints = Float32[np.ndarray, "n m 3"]
+StatePoints = Float32[ndarray, "n m 3"]
 """Material points in each random state."""
 
 STATES = 1500
@@ -56,12 +60,12 @@ CANDIDATES = 40_000
 
 def interior_nodes(rest: SegmentedMesh) -> tuple[Nodes, NodeLabels]:
     """Points inside the segments, evenly spread, as many for each segment, and their labels."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     low, high = rest.bounds
     points = rng.uniform(low, high, size=(CANDIDATES, 3))
     labels = Solids(rest).label(points)
     each = NODES // len(rest.segments)
-    rows = [np.empty(0, dtype=np.int64)]
+    rows = [np.empty(0, np.int64)]
     for label in range(1, len(rest.segments) + 1):
         inside = np.flatnonzero(labels == label)
         if len(inside):
@@ -70,7 +74,7 @@ def interior_nodes(rest: SegmentedMesh) -> tuple[Nodes, NodeLabels]:
     return points[chosen], labels[chosen]
 
 
-def state_points(state: State, nodes: Nodes, labels: NodeLabels) -> Float[np.ndarray, "m 3"]:
+def state_points(state: State, nodes: Nodes, labels: NodeLabels) -> MaterialPoints:
     """Positions to which a state has moved all material points, in the scene's frame."""
     return material_points(state.mesh, moved_by(nodes, labels - 1, state.deformations))
 
@@ -137,11 +141,11 @@ def elastic_model(
     points = material_points(rest, nodes)
     flat = WIDER * solid.modes.reshape(len(solid.modes), -1)
     modes = (solid.solid.mesh.embed(points) @ flat).reshape(len(points), 3, -1).astype(np.float32)
-    library = np.random.default_rng(0).normal(size=(count, modes.shape[2])).astype(np.float32)
+    library = default_rng(0).normal(size=(count, modes.shape[2])).astype(np.float32)
     model = StatisticalModel(rest, nodes, node_labels, points, modes, library, 0.0, PairDistances.none())
     model = replace(model, is_normal=True, is_held=solid.held is not None)
     left = []
-    for state in states.astype(np.float64):
+    for state in states.astype(float):
         T, z = model.project(state)
         left.append(((state - model.material(z) @ T[:3, :3].T - T[:3, 3]) ** 2).sum(axis=1).mean())
     return replace(model, residue=float(np.sqrt(np.mean(left))))
@@ -199,40 +203,38 @@ def build_model(
     _, half = rest_frame(rest)
     library, modes = _principal(seen, most, LEAST_MOTION * half)
     left = unseen - (unseen @ np.linalg.pinv(modes)) @ modes if len(modes) else unseen
-    residue = float(np.sqrt((left.astype(np.float64) ** 2).sum() / (left.size / 3)))
+    residue = float(np.sqrt((left.astype(float) ** 2).sum() / (left.size / 3)))
     layout = np.ascontiguousarray(modes.reshape(len(modes), len(mean), 3).transpose(1, 2, 0))
     pairs = kept_distances(spread(material_points(rest, nodes), PAIR_POINTS), mean, layout, library, half)
     return StatisticalModel(rest, nodes, node_labels, mean, layout, library, residue, pairs)
 
 
-def _aligned(
-    rest: Float[np.ndarray, "m 3"], states: StatePoints
-) -> tuple[Float[np.ndarray, "m 3"], Float32[np.ndarray, "n c"]]:
+def _aligned(rest: MaterialPoints, states: StatePoints) -> tuple[MaterialPoints, Float32[ndarray, "n c"]]:
     """The mean, turned as the rest pose, and the aligned states' differences from it."""
     few = spread(rest, PROCRUSTES_POINTS)
     rotation, center, mean = align_all(states[:, few], PROCRUSTES_ROUNDS, 1e-5 * longest_side(rest))
-    T = fit_rigid(mean.astype(np.float64), rest[few])
+    T = fit_rigid(mean.astype(float), rest[few])
     rotation = (T[:3, :3] @ rotation).astype(np.float32)
     aligned = np.matmul(states - center[:, None], rotation.transpose(0, 2, 1)) + T[:3, 3].astype(np.float32)
     middle = aligned.mean(axis=0)
-    return middle.astype(np.float64), (aligned - middle).reshape(len(states), -1)
+    return middle.astype(float), (aligned - middle).reshape(len(states), -1)
 
 
 def _principal(
-    differences: Float32[np.ndarray, "n c"], most: int, least: float
-) -> tuple[Float32[np.ndarray, "n k"], Float32[np.ndarray, "k c"]]:
+    differences: Float32[ndarray, "n c"], most: int, least: float
+) -> tuple[Float32[ndarray, "n k"], Float32[ndarray, "k c"]]:
     """Coefficients of the states, of unit variance, and the modes, largest first."""
     count, columns = differences.shape
     few = spread_columns(columns, GRAM_POINTS)
     part = differences[:, few]
-    values, vectors = np.linalg.eigh((part @ part.T).astype(np.float64) / len(few) * 3)
+    values, vectors = eigh((part @ part.T).astype(float) / len(few) * 3)
     order = np.argsort(values)[::-1][:most]
     order = order[np.sqrt(np.maximum(values[order], 0.0) / count) > least]
     library = (vectors[:, order] * np.sqrt(count)).astype(np.float32)
     return library, library.T @ differences / np.float32(count)
 
 
-def spread_columns(columns: int, points: int) -> Int[np.ndarray, " c"]:
+def spread_columns(columns: int, points: int) -> Int[ndarray, " c"]:
     """Columns of about ``points`` evenly chosen material points."""
     step = max(1, columns // 3 // points)
     return (np.arange(0, columns // 3, step)[:, None] * 3 + np.arange(3)).ravel()
@@ -265,17 +267,17 @@ class CacheWarning(UserWarning):
     """Warning that something is made each time, because it cannot be kept."""
 
 
-def kept_model(scene: Scene, count: int = OBJECT_STATES) -> StatisticalModel:
+def kept_model(scene: Scene) -> StatisticalModel:
     """Statistical model of a scene: read where it was made before, else made, and kept for the next time.
 
     A ``CacheWarning`` says where it cannot be kept.
     """
-    path = cache_folder() / "models" / f"{model_key(scene, count)}.safetensors"
+    path = cache_folder() / "models" / f"{model_key(scene, OBJECT_STATES)}.safetensors"
     with suppress(OSError, ValueError), limited_memory(path):  # not there, or damaged: it is made again
         if path.is_file():  # a pipe would be waited for
             return read_statistical_model(path.read_bytes())
     with stage("make the object's statistical model, once"):
-        made = scene_model(scene, count)
+        made = scene_model(scene, OBJECT_STATES)
     try:
         save_statistical_model(made, path)
     except (OSError, ValueError) as error:  # a full disk, a place that cannot be written to, or something else there
@@ -305,11 +307,11 @@ def model_key(scene: Scene, count: int) -> str:
     digest.update(np.ascontiguousarray(scene.T_scene_source).tobytes())
     for segment in drawn.rest.segments:
         digest.update(f"{segment.name} {segment.color} {segment.solid} {segment.faces.shape}".encode())
-        digest.update(np.ascontiguousarray(segment.faces, dtype=np.int64).tobytes())
+        digest.update(np.ascontiguousarray(segment.faces, np.int64).tobytes())
     solid = elastic_motion(drawn.sample_deformations)
     states = () if solid is not None else range(KEYED_BY)  # to draw from a solid takes seconds
     for mesh in (drawn.rest, *(drawn.sample_state(example_rng(STATES_SEED, i)).mesh for i in states)):
-        digest.update(np.ascontiguousarray(mesh.merged()[0], dtype=np.float64).tobytes())
+        digest.update(np.ascontiguousarray(mesh.merged()[0], float).tobytes())
     if solid is not None:
         digest.update(f"{solid.digest} {solid.motion!r}".encode())
     return digest.hexdigest()[:32]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 from scipy.spatial import cKDTree
@@ -16,9 +17,11 @@ from scipy.spatial import cKDTree
 from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformations
 from mereo.deformation.tetrahedral import Surface, SurfaceMap, Tetrahedra, TetrahedralMap
+from mereo.geometry.conventions import Triple
 from mereo.geometry.mesh import Elements, Segment, SegmentedMesh, Vertices
 from mereo.geometry.transforms import AnyPoints, Points, Vector, longest_side
 from mereo.io.simulation_states import SurfaceRecord, TetrahedralRecord, read_states
+from mereo.io.vtk_frames import FramePoints
 from mereo.scenes.scene import Scene, Workspace
 
 HELD_OUT = 0.1
@@ -57,7 +60,7 @@ def load_states(
     *,
     mesh: Path | None = None,
     scale: float = 1.0,
-    shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    shift: Triple = (0.0, 0.0, 0.0),
     held_out: float = HELD_OUT,
 ) -> SplitStates:
     """Recorded states of an object; ``scene = file * scale + shift`` takes the file's coordinates to those of ``rest``.
@@ -73,7 +76,7 @@ def load_states(
     Raises ``FileNotFoundError`` for nothing at ``path``, ``ImportError`` for a format of VTK without the extra
     `simulation`, ``ValueError`` for damaged files, frames that do not fit ``rest``, or turn something inside out.
     """
-    offset = np.asarray(shift, dtype=np.float64)
+    offset = np.asarray(shift, float)
     if not (np.isfinite(scale) and scale > 0 and offset.shape == (3,) and np.isfinite(offset).all()):
         raise ValueError(f"scale is {scale} and shift {shift}; they must be finite, scale above 0, shift of 3 numbers")
     record = read_states(Path(path), rest.names, mesh)
@@ -116,7 +119,7 @@ class TetrahedralFrames:
     """
 
     mesh: Tetrahedra
-    displacements: Float[np.ndarray, "f n 3"]
+    displacements: FramePoints
     scale: float
     segments: int
 
@@ -127,7 +130,7 @@ class TetrahedralFrames:
 
     def nodes(self, frame: int) -> Points:
         """Node positions in scene units."""
-        return self.mesh.nodes + self.scale * self.displacements[frame].astype(np.float64)
+        return self.mesh.nodes + self.scale * self.displacements[frame].astype(float)
 
     def deformations(self, frame: int) -> Deformations:
         """Deformations of the segments in one frame: one map for all of them."""
@@ -180,7 +183,7 @@ class SurfaceFrames:
     """
 
     surfaces: tuple[Surface, ...]
-    vertices: tuple[Float[np.ndarray, "f _ 3"], ...]
+    vertices: tuple[Float[ndarray, "f _ 3"], ...]
     scale: float
     shift: Vector
 
@@ -191,7 +194,7 @@ class SurfaceFrames:
 
     def positions(self, segment: int, frame: int) -> AnyPoints:
         """Vertices of one segment in scene units."""
-        return self.vertices[segment][frame].astype(np.float64) * self.scale + self.shift
+        return self.vertices[segment][frame].astype(float) * self.scale + self.shift
 
     def deformations(self, frame: int) -> Deformations:
         """Deformations of the segments in one frame, a map of its own for each."""
@@ -222,9 +225,7 @@ def _surface_frames(
     return frames
 
 
-def _order(
-    path: Path, segment: Segment, count: int, known: Float[np.ndarray, "w 3"] | None
-) -> slice | Int[np.ndarray, " v"]:
+def _order(path: Path, segment: Segment, count: int, known: Float[ndarray, "w 3"] | None) -> slice | Int[ndarray, " v"]:
     """Which vertex of the states is each of the mesh's: by rest position where the file has it, else one to one."""
     cure = f"name the states' own mesh at rest by the key mesh (in an NPZ file '{segment.name}.rest')"
     if known is None:
@@ -247,7 +248,7 @@ def _order(
             f"{size:.3g} across; without tetrahedra they must be the same vertices in the same pose: check the unit, "
             "scale and shift, or name a mesh with tetrahedra"
         )
-    return np.asarray(nearest, dtype=np.int64)
+    return np.asarray(nearest, np.int64)
 
 
 def _check_order(path: Path, segment: Segment, vertices: Vertices) -> None:

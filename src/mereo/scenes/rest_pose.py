@@ -37,7 +37,7 @@ def rest_digest(rest: SegmentedMesh) -> str:
     digest = hashlib.sha256()
     for segment in rest.segments:
         for array in (np.rint(segment.vertices / step), segment.faces):
-            digest.update(np.ascontiguousarray(array, dtype="<i8").tobytes())
+            digest.update(np.ascontiguousarray(array, "<i8").tobytes())
     return digest.hexdigest()
 
 

@@ -1,9 +1,9 @@
 """Scenes: a segmented model at rest, its random deformations, and where a camera may stand (paper, appendix B)."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from math import pi, radians
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.linalg import det
@@ -11,9 +11,9 @@ from numpy.random import Generator
 
 from mereo.deformation.maps import Deformations
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.conventions import Range, WorkspaceName
+from mereo.geometry.conventions import Facts, Range, Triple, WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import AnyPoints, Transform, Vector, look_at, rotation_along
+from mereo.geometry.transforms import Transform, Vector, look_at, rotation_along
 from mereo.io.atomic_files import JsonObject
 from mereo.io.config import Space
 from mereo.scenes.seeds import TEST_SEED_START
@@ -40,11 +40,11 @@ class SourceFrame:
         return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m, "space": self.space}
 
     @classmethod
-    def of_facts(cls, facts: Mapping[str, Any] | None) -> "SourceFrame | None":
+    def of_facts(cls, facts: Facts | None) -> "SourceFrame | None":
         """Inverse of ``facts``; None for files from before it was known."""
         if facts is None:
             return None
-        return cls(np.asarray(facts["T_scene_source"], dtype=np.float64), facts["unit_m"], facts.get("space"))
+        return cls(np.asarray(facts["T_scene_source"], float), facts["unit_m"], facts.get("space"))
 
 
 GUESSED_UNIT_M = 0.01
@@ -56,7 +56,7 @@ SCENES = (
 )
 """Built-in scenes, one module each in ``mereo_objects``: the paper's ten, then ours."""
 
-PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD = float(np.deg2rad(140.0)), float(np.deg2rad(360.0))
+PAPER_APERTURE_RAD, WHOLE_SPHERE_RAD = radians(140.0), radians(360.0)
 
 
 class AssetUnavailable(OSError):
@@ -78,9 +78,9 @@ class Workspace:
 
     aperture_rad: float = PAPER_APERTURE_RAD
     distance: Range = (100.0, 200.0)
-    axis: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    axis: Triple = (0.0, 0.0, 1.0)
     any_roll: bool = False
-    fov_rad: float = float(np.deg2rad(35.0))
+    fov_rad: float = radians(35.0)
 
     @property
     def all_around(self) -> bool:
@@ -89,10 +89,10 @@ class Workspace:
 
     def sample(self, rng: Generator, target: Vector) -> Transform:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, uniform in direction and in distance."""
-        cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, np.pi)), 1.0)
-        azimuth = rng.uniform(0.0, 2 * np.pi)
+        cosine = rng.uniform(np.cos(min(self.aperture_rad / 2, pi)), 1.0)
+        azimuth = rng.uniform(0.0, 2 * pi)
         distance = rng.uniform(*self.distance)
-        roll = rng.uniform(0.0, 2 * np.pi) if self.any_roll else 0.0
+        roll = rng.uniform(0.0, 2 * pi) if self.any_roll else 0.0
         return self.pose(target, cosine, azimuth, distance, roll)
 
     def pose(
@@ -101,8 +101,8 @@ class Workspace:
         """Pose ``T_world_camera`` of a camera aimed at ``target``, by its azimuth and the cosine of its tilt."""
         sine = np.sqrt(1.0 - cosine**2)
         local = np.array([sine * np.cos(azimuth_rad), sine * np.sin(azimuth_rad), cosine])
-        to_camera = rotation_along(np.asarray(self.axis, dtype=float)) @ local
-        return look_at(target + distance * to_camera, target, np.asarray(self.axis, dtype=float), roll_rad)
+        to_camera = rotation_along(np.asarray(self.axis, float)) @ local
+        return look_at(target + distance * to_camera, target, np.asarray(self.axis, float), roll_rad)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,7 +142,7 @@ class Scene:
     name: str
     rest: SegmentedMesh
     sample_deformations: Draw
-    workspace: Workspace = field(default_factory=Workspace)
+    workspace: Workspace = Workspace()
     source: str = "modelled in mereo's own code, MIT licence"
     held_out: "Scene | None" = None
     unit_m: float | None = None
@@ -192,7 +192,7 @@ class Scene:
 
     def deform(self, deformations: Deformations) -> State:
         """State made by one deformation per segment; vertices shared by a common map are moved in one call."""
-        moved: list[AnyPoints] = [np.empty((0, 3))] * len(deformations)
+        moved = [np.empty((0, 3))] * len(deformations)
         for shared in {id(each): each for each in deformations}.values():
             members = [index for index, each in enumerate(deformations) if each is shared]
             parts = [self.rest.segments[index].vertices for index in members]

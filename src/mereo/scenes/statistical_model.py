@@ -7,19 +7,20 @@ deviation, so the prior of the coefficients ``z`` is N(0, 1) each. Lengths are s
 Notation: m material points (first the vertices of ``rest.merged()``, then the nodes), k modes, n states.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
-from numpy.linalg import inv
+from numpy import ndarray
+from numpy.linalg import inv, solve
+from numpy.random import default_rng
 from scipy.special import ndtri
 
 from mereo.deformation.moving_least_squares import ANCHORS, Anchors, PointWeights, spread
 from mereo.geometry.brief import counted, listed
+from mereo.geometry.conventions import Facts, Names, WholeNumbers
 from mereo.geometry.mesh import Faces, Segment, SegmentedMesh
 from mereo.geometry.symmetry import TOLERANCE, Symmetry, find_symmetries
 from mereo.geometry.transforms import Labels, Points, Transform, Values, Vector, fit_rigid, transform_points
@@ -30,10 +31,10 @@ from mereo.io.object_storage import Place, write_whole
 from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import SourceFrame
 
-MaterialPoints = Float[np.ndarray, "m 3"]
+MaterialPoints = Float[ndarray, "m 3"]
 """Positions of the material points, in rows."""
 
-PerMode = Float[np.ndarray, " k"]
+PerMode = Float[ndarray, " k"]
 """A number for each mode."""
 
 # --- distances that all states keep -----------------------------------------------------------------------------------
@@ -57,10 +58,10 @@ FLOOR = 0.002
 class PairDistances:
     """Pairs of material points, and mean and standard deviation of their distance; there may be none."""
 
-    first: Int[np.ndarray, " q"]
-    second: Int[np.ndarray, " q"]
-    mean: Float[np.ndarray, " q"]
-    std: Float[np.ndarray, " q"]
+    first: Int[ndarray, " q"]
+    second: Int[ndarray, " q"]
+    mean: Float[ndarray, " q"]
+    std: Float[ndarray, " q"]
 
     def __len__(self) -> int:
         return len(self.first)
@@ -68,21 +69,21 @@ class PairDistances:
     @classmethod
     def none(cls) -> "PairDistances":
         """No pairs."""
-        return cls(*(np.empty(0, dtype=np.int64),) * 2, *(np.empty(0),) * 2)
+        return cls(*(np.empty(0, np.int64),) * 2, *(np.empty(0),) * 2)
 
 
 def kept_distances(
-    tried: Int[np.ndarray, " v"],
+    tried: Int[ndarray, " v"],
     mean: MaterialPoints,
-    modes: Float32[np.ndarray, "m 3 k"],
-    library: Float32[np.ndarray, "n k"],
+    modes: Float32[ndarray, "m 3 k"],
+    library: Float32[ndarray, "n k"],
     half: float,
 ) -> PairDistances:
     """Distances among the ``tried`` material points that the states keep; see ``LEAST_RATIO``.
 
     ``mean``, ``modes`` and ``library`` are the linear model's, ``half`` is half of the rest box's longest side.
     """
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     first, second = np.triu_indices(len(tried), 1)
     middle, motion = mean[tried].astype(np.float32), modes[tried]
     states = library[rng.permutation(len(library))[:TRIED_STATES]]
@@ -94,19 +95,17 @@ def kept_distances(
     kept = np.flatnonzero(np.sqrt(((linear - center) ** 2).mean(axis=0)) > LEAST_RATIO * std)
     if len(kept) > MOST_PAIRS:
         kept = np.sort(rng.choice(kept, MOST_PAIRS, replace=False))
-    return PairDistances(
-        tried[first[kept]], tried[second[kept]], center[kept].astype(np.float64), std[kept].astype(np.float64)
-    )
+    return PairDistances(tried[first[kept]], tried[second[kept]], center[kept].astype(float), std[kept].astype(float))
 
 
 def _distances(
-    mean: Float32[np.ndarray, "v 3"], modes: Float32[np.ndarray, "v 3 k"], z: Float32[np.ndarray, "n k"]
-) -> Float32[np.ndarray, "n v v"]:
+    mean: Float32[ndarray, "v 3"], modes: Float32[ndarray, "v 3 k"], z: Float32[ndarray, "n k"]
+) -> Float32[ndarray, "n v v"]:
     """Between all pairs of points in each state."""
     points = mean + (z @ modes.reshape(3 * len(mean), z.shape[1]).T).reshape(len(z), -1, 3)
     squared = (points**2).sum(axis=2)
     product = np.matmul(points, points.transpose(0, 2, 1))
-    return np.asarray(np.sqrt(np.maximum(squared[:, :, None] + squared[:, None] - 2 * product, 0.0)))
+    return np.sqrt(np.maximum(squared[:, :, None] + squared[:, None] - 2 * product, 0.0))
 
 
 # --- statistical model ------------------------------------------------------------------------------------------------
@@ -114,7 +113,7 @@ def _distances(
 SPARSE, SILHOUETTE_VERTICES = 200, 1500
 """Material points by which states of the library are compared, and vertices compared with what a frame rules out."""
 
-OF_REST: tuple[str, ...] = (
+OF_REST: Names = (
     *("faces", "vertex_counts", "labels", "rest_points", "half", "rest_center"),
     *("anchors", "rest_anchors", "silhouette_vertices", "sparse"),
 )
@@ -145,11 +144,11 @@ class StatisticalModel:
     """
 
     rest: SegmentedMesh
-    nodes: Float[np.ndarray, "j 3"]
-    node_labels: UInt8[np.ndarray, " j"]
+    nodes: Float[ndarray, "j 3"]
+    node_labels: UInt8[ndarray, " j"]
     mean: MaterialPoints
-    modes: Float32[np.ndarray, "m 3 k"]
-    library: Float32[np.ndarray, "n k"]
+    modes: Float32[ndarray, "m 3 k"]
+    library: Float32[ndarray, "n k"]
     residue: float
     pairs: PairDistances
     source_frame: SourceFrame | None = None
@@ -172,7 +171,7 @@ class StatisticalModel:
         return find_symmetries(self.rest, TOLERANCE)
 
     @property
-    def swaps(self) -> tuple[tuple[int, ...], ...]:
+    def swaps(self) -> tuple[WholeNumbers, ...]:
         """Exchanges of segments that no frame tells from the rest pose: for each segment the one in its place."""
         swaps = (tuple(i for i in each.lands_on if i is not None) for each in self.symmetries if each.swaps)
         return tuple(dict.fromkeys(swaps))
@@ -188,12 +187,12 @@ class StatisticalModel:
         return self.rest.merged()[1].astype(np.int64)
 
     @cached_property
-    def vertex_counts(self) -> tuple[int, ...]:
+    def vertex_counts(self) -> WholeNumbers:
         """Number of vertices of each segment."""
         return tuple(len(segment.vertices) for segment in self.rest.segments)
 
     @cached_property
-    def labels(self) -> UInt8[np.ndarray, " m"]:
+    def labels(self) -> UInt8[ndarray, " m"]:
         """Label of each material point."""
         owner = np.repeat(np.arange(len(self.vertex_counts)), self.vertex_counts)
         return np.concatenate([owner + 1, self.node_labels]).astype(np.uint8)
@@ -221,7 +220,7 @@ class StatisticalModel:
         return rest_frame(self.rest)[0]
 
     @cached_property
-    def anchors(self) -> tuple[Int[np.ndarray, " a"], ...]:
+    def anchors(self) -> tuple[Int[ndarray, " a"], ...]:
         """Anchors of each segment: the material points that others of it follow."""
         *firsts, count = np.cumsum([0, *self.vertex_counts])
         return tuple(
@@ -235,24 +234,24 @@ class StatisticalModel:
         return tuple(Anchors(index, self.rest_points[index]) for index in self.anchors)
 
     @cached_property
-    def silhouette_vertices(self) -> Int[np.ndarray, " w"]:
+    def silhouette_vertices(self) -> Int[ndarray, " w"]:
         """Surface vertices, evenly spread."""
         return spread(self.rest_points[: sum(self.vertex_counts)], SILHOUETTE_VERTICES)
 
     @cached_property
-    def sparse(self) -> Int[np.ndarray, " p"]:
+    def sparse(self) -> Int[ndarray, " p"]:
         """A few material points that tell shapes apart."""
         return spread(self.rest_points, SPARSE)
 
     @cached_property
-    def sparse_library(self) -> Float32[np.ndarray, "n p 3"]:
+    def sparse_library(self) -> Float32[ndarray, "n p 3"]:
         """Positions of these few in all states of the library."""
         motion = self.library @ self.modes[self.sparse].reshape(3 * len(self.sparse), self.count).T
         return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
 
-    def around(self, mean: MaterialPoints, modes: Float32[np.ndarray, "m 3 d"]) -> "StatisticalModel":
+    def around(self, mean: MaterialPoints, modes: Float32[ndarray, "m 3 d"]) -> "StatisticalModel":
         """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
-        library = np.zeros((0, modes.shape[2]), dtype=np.float32)
+        library = np.zeros((0, modes.shape[2]), np.float32)
         other = replace(self, mean=mean, modes=modes, library=library, pairs=PairDistances.none())
         vars(other).update({name: getattr(self, name) for name in OF_REST})
         return other
@@ -264,7 +263,7 @@ class StatisticalModel:
     @cached_property
     def motion(self) -> PerMode:
         """Root mean square motion of the material points for one standard deviation of each mode."""
-        squared = np.einsum("mck,mck->k", self.modes, self.modes, dtype=np.float64)
+        squared = np.einsum("mck,mck->k", self.modes, self.modes, dtype=float)
         return np.sqrt(squared / len(self.modes))
 
     @cached_property
@@ -295,7 +294,7 @@ class StatisticalModel:
     @cached_property
     def _squares(self) -> Values:
         """Logarithms of the library's mean squared coefficients, in order."""
-        squares = (self.library.astype(np.float64) ** 2).mean(axis=1)
+        squares = (self.library.astype(float) ** 2).mean(axis=1)
         return np.log(np.sort(np.maximum(squares, np.finfo(float).tiny)))
 
     def unusual(self, z: PerMode) -> float:
@@ -312,7 +311,7 @@ class StatisticalModel:
     def mesh(self, material: MaterialPoints) -> SegmentedMesh:
         """The segments, with the rest mesh's faces, at these positions."""
         ends = np.cumsum(self.vertex_counts)
-        return self.rest.with_vertices(np.split(material[: ends[-1]].astype(np.float64), ends[:-1]))
+        return self.rest.with_vertices(np.split(material[: ends[-1]].astype(float), ends[:-1]))
 
     def weights(self, points: Points, labels: Labels) -> PointWeights:
         """Weights by which points at rest, of the segments ``labels`` (1 or more), follow the material points."""
@@ -320,17 +319,17 @@ class StatisticalModel:
 
     def project(self, material: MaterialPoints) -> tuple[Transform, PerMode]:
         """Pose and coefficients of a state: ``T_state_model`` and z of (nearly) least squared distance."""
-        flat = self.modes.reshape(3 * len(self.modes), self.count).astype(np.float64)
+        flat = self.modes.reshape(3 * len(self.modes), self.count).astype(float)
         normal = flat.T @ flat + 1e-9 * np.trace(flat.T @ flat) * np.eye(self.count)
         z = np.zeros(self.count)
         for _ in range(PROJECTIONS):
             T = fit_rigid(self.mean + (flat @ z).reshape(-1, 3), material)
             unposed = (material - T[:3, 3]) @ T[:3, :3]
-            z = np.linalg.solve(normal, flat.T @ (unposed - self.mean).ravel())
+            z = solve(normal, flat.T @ (unposed - self.mean).ravel())
         return fit_rigid(self.mean + (flat @ z).reshape(-1, 3), material), z
 
 
-def material_points(mesh: SegmentedMesh, nodes: Float[np.ndarray, "j 3"]) -> MaterialPoints:
+def material_points(mesh: SegmentedMesh, nodes: Float[ndarray, "j 3"]) -> MaterialPoints:
     """Vertices of all segments, then the nodes."""
     return np.concatenate([*(segment.vertices for segment in mesh.segments), nodes])
 
@@ -338,7 +337,7 @@ def material_points(mesh: SegmentedMesh, nodes: Float[np.ndarray, "j 3"]) -> Mat
 def following(anchors: tuple[Anchors, ...], points: Points, labels: Labels) -> PointWeights:
     """Weights of points by the anchors of their own segments."""
     width = max((min(len(a.index), 32) for a in anchors), default=1)
-    index = np.zeros((len(points), width), dtype=np.int64)
+    index = np.zeros((len(points), width), np.int64)
     weight = np.zeros((len(points), width))
     for label in np.unique(labels):
         rows = np.flatnonzero(labels == label)
@@ -361,7 +360,7 @@ LIBRARY_STEP, WIDE_MODES = 1 / 32, 12
 """Step of a coefficient, whose bytes reach to 4 standard deviations, and how many first modes have two bytes."""
 
 
-def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], JsonObject]:
+def pack_model(model: StatisticalModel) -> tuple[dict[str, ndarray], JsonObject]:
     """Tensors of a statistical model, and the facts about it that are none: names, colours, sizes, residue."""
     wide, wide_scale = _integers(model.modes[..., :WIDE_MODES], np.int16)
     narrow, narrow_scale = _integers(model.modes[..., WIDE_MODES:], np.int8)
@@ -396,15 +395,15 @@ def pack_model(model: StatisticalModel) -> tuple[dict[str, np.ndarray], JsonObje
     return {name: np.ascontiguousarray(value) for name, value in tensors.items()}, facts
 
 
-def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel:
+def unpack_model(tensors: Tensors, facts: Facts) -> StatisticalModel:
     """Inverse of ``pack_model`` up to rounding."""
-    index, (mean, std) = tensors["pair_index"].astype(np.int64), tensors["pair_distance"].astype(np.float64)
+    index, (mean, std) = tensors["pair_index"].astype(np.int64), tensors["pair_distance"].astype(float)
     steps = np.concatenate([tensors["wide_modes"], tensors["modes"]], axis=2, dtype=np.float32)
     return StatisticalModel(
         rest=_rest(tensors, facts),
-        nodes=tensors["nodes"].astype(np.float64),
+        nodes=tensors["nodes"].astype(float),
         node_labels=tensors["node_labels"],
-        mean=tensors["mean"].astype(np.float64),
+        mean=tensors["mean"].astype(float),
         modes=steps * tensors["mode_scale"],
         library=tensors["library"].astype(np.float32) * np.float32(LIBRARY_STEP),
         residue=float(facts["residue"]),
@@ -415,9 +414,9 @@ def unpack_model(tensors: Tensors, facts: Mapping[str, Any]) -> StatisticalModel
     )
 
 
-def save_statistical_model(model: StatisticalModel, path: Path, dataset: str | None = None) -> None:
-    """Write a statistical model as one safetensors file, whole or not at all; ``dataset`` is the key of its dataset."""
-    write_whole(path, statistical_model_bytes(model, dataset))
+def save_statistical_model(model: StatisticalModel, path: Path) -> None:
+    """Write a statistical model as one safetensors file, whole or not at all."""
+    write_whole(path, statistical_model_bytes(model))
 
 
 def statistical_model_bytes(model: StatisticalModel, dataset: str | None = None) -> bytes:
@@ -470,21 +469,21 @@ def modes_within(model: StatisticalModel, size: int) -> int:
 
 
 def _integers(
-    modes: Float32[np.ndarray, "m 3 k"], dtype: type[np.signedinteger]
-) -> tuple[Int[np.ndarray, "m 3 k"], Float32[np.ndarray, " k"]]:
+    modes: Float32[ndarray, "m 3 k"], dtype: type[np.signedinteger]
+) -> tuple[Int[ndarray, "m 3 k"], Float32[ndarray, " k"]]:
     """Modes in steps of their largest motion, and the motion that one step of each stands for."""
     scale = (np.abs(modes).max(axis=(0, 1), initial=1e-12) / np.iinfo(dtype).max).astype(np.float32)
     return np.rint(modes / scale).astype(dtype), scale
 
 
-def _narrow(index: np.ndarray) -> np.ndarray:
+def _narrow(index: ndarray) -> ndarray:
     """Indices in two bytes where they fit."""
     return index.astype(np.uint16 if index.size == 0 or index.max() < 2**16 else np.uint32)
 
 
-def _rest(tensors: Tensors, facts: Mapping[str, Any]) -> SegmentedMesh:
+def _rest(tensors: Tensors, facts: Facts) -> SegmentedMesh:
     """The segments at rest."""
-    vertices, faces = tensors["vertices"].astype(np.float64), tensors["faces"].astype(np.int64)
+    vertices, faces = tensors["vertices"].astype(float), tensors["faces"].astype(np.int64)
     first, start, segments = 0, 0, []
     for name, color, solid, points, triangles in zip(
         *(facts[key] for key in ("names", "colors", "solid", "vertices", "faces")), strict=True

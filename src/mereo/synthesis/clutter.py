@@ -5,14 +5,14 @@ Occluders are solid bodies with a depth of their own (sources in docs/design/000
 """
 
 from dataclasses import dataclass
+from math import inf, pi
 
 import numpy as np
-from jaxtyping import Int
 from numpy.linalg import norm
 from numpy.random import Generator
 
 from mereo.geometry.solids import Hits, Solids, toward
-from mereo.geometry.transforms import Labels, Matrix, Points, Values, Vector
+from mereo.geometry.transforms import Labels, Matrix, Points, Subset, Values, Vector
 from mereo.synthesis.config import Occluder, SensorConfig
 
 NOTHING, OBJECT, OCCLUDER, BACKGROUND = range(4)
@@ -27,7 +27,7 @@ class Capsule:
     end: Vector
     radius: float
 
-    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Subset, Hits]:
         """Rows of the rays from the origin that hit the capsule, and where each of them does first."""
         low, high = np.minimum(self.start, self.end) - self.radius, np.maximum(self.start, self.end) + self.radius
         rows = toward(directions, low, high)
@@ -49,7 +49,7 @@ class Capsule:
         axis = self.end - self.start
         length = float(norm(axis))
         if length == 0:
-            return np.full(len(rays), np.inf)
+            return np.full(len(rays), inf)
         axis = axis / length
         along, offset = rays @ axis, float(self.start @ axis)
         across, start = rays - along[:, None] * axis, self.start - offset * axis
@@ -57,14 +57,14 @@ class Capsule:
             np.einsum("ij,ij->i", across, across), across @ start, np.full(len(rays), start @ start - self.radius**2)
         )
         place = np.where(np.isfinite(distance), distance, 0.0) * along - offset
-        return np.where((place >= 0) & (place <= length), distance, np.inf)
+        return np.where((place >= 0) & (place <= length), distance, inf)
 
 
 def _entry(a: Values, b: Values, c: Values) -> Values:
     """The smaller root of a t^2 - 2 b t + c = 0 where it is positive, else infinity."""
     discriminant = b * b - a * c
     root = (b - np.sqrt(np.maximum(discriminant, 0.0))) / np.maximum(a, 1e-300)
-    return np.where((discriminant > 0) & (a > 0) & (root > 0), root, np.inf)
+    return np.where((discriminant > 0) & (a > 0) & (root > 0), root, inf)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Backdrop:
     normal: Vector
     offset: float
 
-    def first_hit(self, directions: Points) -> tuple[Int[np.ndarray, " m"], Hits]:
+    def first_hit(self, directions: Points) -> tuple[Subset, Hits]:
         """Rows of the rays from the origin that hit the plane, and where."""
         slope = directions @ self.normal
         rows = np.flatnonzero(slope > 1e-6)
@@ -133,7 +133,7 @@ def sample_occluder(kind: Occluder, seen: Points, reach: float, unit: float, rng
 
 def sample_plane(solids: Solids, unit: float, rng: Generator) -> Backdrop:
     """Random table or wall behind the object: up to 45 degrees off the image plane, touching to 5 cm behind."""
-    normal = _polar(np.tan(rng.uniform(0, np.pi / 4)), rng.uniform(0, 2 * np.pi))
+    normal = _polar(np.tan(rng.uniform(0, pi / 4)), rng.uniform(0, 2 * pi))
     normal = normal / norm(normal)
     return Backdrop(normal, farthest(solids, normal) + rng.uniform(0, 0.05) * unit)
 
@@ -152,7 +152,7 @@ def _approach(seen: Points, reach: float, unit: float, rng: Generator) -> tuple[
     """A tip up to 3 cm before a visible point, and the way out: a point nearer to the camera, outside the image."""
     target = seen[rng.integers(len(seen))]
     tip = target * max(1 - rng.uniform(0.002, 0.03) * unit / target[2], 0.5)
-    out = tip[2] * rng.uniform(0.65, 0.95) * _polar(1.1 * reach, rng.uniform(0, 2 * np.pi))
+    out = tip[2] * rng.uniform(0.65, 0.95) * _polar(1.1 * reach, rng.uniform(0, 2 * pi))
     return tip, out
 
 
@@ -207,6 +207,6 @@ def _hand_frame(tip: Vector, out: Vector, rng: Generator) -> Matrix:
     away = tip - (tip @ along) * along
     away /= norm(away)
     across = np.cross(along, away)
-    roll = rng.uniform(-np.pi / 4, np.pi / 4)
+    roll = rng.uniform(-pi / 4, pi / 4)
     cosine, sine = np.cos(roll), np.sin(roll)
     return np.stack([cosine * across + sine * away, along, cosine * away - sine * across])

@@ -3,7 +3,7 @@
 Light, so that the command line may import them.
 """
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Literal
 
 from tyro.conf import OmitArgPrefixes
@@ -170,8 +170,8 @@ class GenerateConfig:
     noise_std: NotNegative = 0.1
     points: Points = 1024
     # the marker keeps --sampler short on the command line, where --sensor.axial keeps its prefix
-    sampling: OmitArgPrefixes[SamplingConfig] = field(default_factory=SamplingConfig)
-    sensor: SensorConfig = field(default_factory=SensorConfig)
+    sampling: OmitArgPrefixes[SamplingConfig] = SamplingConfig()
+    sensor: SensorConfig = SensorConfig()
     observations: tuple[ObservationName | Literal["all"], ...] = ()
     workspace: WorkspaceName = "own"
 

@@ -8,14 +8,16 @@ ray and surface normal.
 
 from dataclasses import dataclass
 from functools import lru_cache
+from math import pi, radians
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 from scipy import ndimage
 
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import Camera, DepthImage, PixelMask, PixelValues
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Hits, Solids
@@ -23,19 +25,13 @@ from mereo.geometry.transforms import Labels, Points, Values, unit_rows
 from mereo.synthesis.clutter import NOTHING, OBJECT, Surroundings, sample_surroundings
 from mereo.synthesis.config import SENSOR_TERMS, SensorConfig, SensorModel
 
-Numbers = Float[np.ndarray, "*n"]
+Numbers = Float[ndarray, "*n"]
 """Numbers in any shape, which the whole signature has."""
 
-PixelValues = Float[np.ndarray, "h w"]
-"""A number for each pixel."""
-
-PixelMask = Bool[np.ndarray, "h w"]
-"""Whether each pixel is meant."""
-
-STEEPEST_RAD = float(np.deg2rad(80.0))
+STEEPEST_RAD = radians(80.0)
 """Largest angle of the noise formulas, which have a pole at 90 degrees: steeper surfaces count as seen at this one."""
 
-GRAZING_RAD = float(np.deg2rad(60.0))
+GRAZING_RAD = radians(60.0)
 """Angle from which on axial noise rises steeply and pixels go missing."""
 
 KINECT_FOCAL_PX, KINECT_DISPARITY_M = 585.0, 351.3
@@ -54,7 +50,7 @@ class SimulatedView:
 
     whole: DepthImage
     mask: PixelMask
-    source: UInt8[np.ndarray, "h w"]
+    source: UInt8[ndarray, "h w"]
 
     @property
     def image(self) -> DepthImage:
@@ -148,7 +144,7 @@ def lateral_std(z_m: Numbers, angle_rad: Numbers, model: SensorModel = "structur
     if model == "time-of-flight":
         return 0.0016 / z_m
     angle = np.minimum(angle_rad, STEEPEST_RAD)
-    return (0.8 + 0.035 * angle / (np.pi / 2 - angle)) / KINECT_FOCAL_PX
+    return (0.8 + 0.035 * angle / (pi / 2 - angle)) / KINECT_FOCAL_PX
 
 
 # --- depth ------------------------------------------------------------------------------------------------------------
@@ -162,7 +158,7 @@ def axial_std_m(z_m: Numbers, angle_rad: Numbers, model: SensorModel = "structur
     0.1 z^3/2 a^2 / (pi/2 - a)^2 millimetres.
     """
     angle = np.minimum(angle_rad, STEEPEST_RAD)
-    slant = (angle / (np.pi / 2 - angle)) ** 2
+    slant = (angle / (pi / 2 - angle)) ** 2
     if model == "time-of-flight":
         return 0.001 * (1.5 - 0.5 * z_m + 0.3 * z_m**2 + 0.1 * z_m**1.5 * slant)
     return 0.0012 + 0.0019 * (z_m - 0.4) ** 2 + 0.0001 * slant / np.sqrt(z_m)
@@ -232,14 +228,14 @@ def sample_holes(
 
     A Poisson number of ellipses at object pixels with gamma-distributed radii (shape 5).
     """
-    holes = np.zeros(depth.shape, dtype=bool)
+    holes = np.zeros(depth.shape, bool)
     rows, columns = np.nonzero(seen)
     if len(rows) == 0 or sensor.holes == 0:
         return holes
     v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     for chosen in rng.integers(len(rows), size=rng.poisson(sensor.holes)):
         row, column = rows[chosen], columns[chosen]
-        radii_m, angle = rng.gamma(5.0, sensor.hole_radius_m / 5.0, size=2), rng.uniform(0, np.pi)
+        radii_m, angle = rng.gamma(5.0, sensor.hole_radius_m / 5.0, size=2), rng.uniform(0, pi)
         a, b = radii_m * focal_px / (depth[row, column] * sensor.metres_per_unit)
         along = (u - column) * np.cos(angle) + (v - row) * np.sin(angle)
         across = (v - row) * np.cos(angle) - (u - column) * np.sin(angle)
@@ -265,7 +261,7 @@ def sample_mask(seen: PixelMask, sensor: SensorConfig, streams: dict[str, Genera
 
 
 @lru_cache(maxsize=8)
-def _bumps(size: int, nodes: int) -> Float[np.ndarray, "s n"]:
+def _bumps(size: int, nodes: int) -> Float[ndarray, "s n"]:
     """Weights of the nodes at each pixel; their squares sum to 1."""
     pixels, centers = np.arange(size)[:, None] / max(size - 1, 1), np.linspace(0, 1, nodes)
     weights = np.exp(-0.5 * ((pixels - centers) * (nodes - 1) / 0.7) ** 2)

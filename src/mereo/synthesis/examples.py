@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy import ndarray
 from numpy.random import Generator
 
 from mereo.deformation.maps import Deformations, invert
@@ -39,7 +40,7 @@ from mereo.synthesis.config import OBSERVATIONS, GenerateConfig, SensorConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.query_sampling import Samples, sample_queries
 
-QueryPoints = Float[np.ndarray, "q 3"]
+QueryPoints = Float[ndarray, "q 3"]
 """Positions or vectors at the query points, in rows."""
 
 ATTEMPTS = 100
@@ -76,8 +77,8 @@ class LabelledPoints:
     """
 
     positions: QueryPoints
-    labels: UInt8[np.ndarray, " q"]
-    distances: Float[np.ndarray, " q"]
+    labels: UInt8[ndarray, " q"]
+    distances: Float[ndarray, " q"]
     directions: QueryPoints
     rest: QueryPoints
 
@@ -93,7 +94,7 @@ class Example:
         observations: further clouds of the same state and camera in that frame (``synthesis.examples``).
     """
 
-    cloud: Float[np.ndarray, "p 3"]
+    cloud: Float[ndarray, "p 3"]
     normalizer: Normalizer
     queries: LabelledPoints
     observations: tuple[AnyPoints, ...] = ()

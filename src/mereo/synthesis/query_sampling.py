@@ -9,10 +9,12 @@ result does not depend on the size of a batch: it is, bit for bit, that of drawi
 """
 
 from collections.abc import Callable
+from math import inf
 from typing import NamedTuple, NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from scipy.spatial import cKDTree
@@ -20,7 +22,7 @@ from scipy.spatial import cKDTree
 from mereo.geometry.transforms import Flags, Labels, Values
 from mereo.synthesis.config import SamplingConfig
 
-Places = Float[np.ndarray, "n d"]
+Places = Float[ndarray, "n d"]
 """Positions in rows, in space of any dimension."""
 
 # --- labels -----------------------------------------------------------------------------------------------------------
@@ -42,7 +44,7 @@ class Shape(Protocol):
     nesting: tuple[tuple[int, int], ...]
     """Indices (inner, outer) of segments declared to lie one inside the other; the inner one comes first."""
 
-    def boxes(self) -> Float[np.ndarray, "s 2 d"]:
+    def boxes(self) -> Float[ndarray, "s 2 d"]:
         """Lower and upper corner of each segment's axis-aligned box."""
 
     def label(self, points: Places) -> Labels:
@@ -65,7 +67,7 @@ def owner_labels(shape: Shape, points: Places) -> Labels:
     holds = np.stack([shape.inside(index, points) for index in range(shape.count)])
     labels = np.where(holds.any(axis=0), holds.argmax(axis=0) + 1, 0).astype(np.uint8)
     shared = np.flatnonzero(holds.sum(axis=0) > 1)
-    distance = np.full((shape.count, len(shared)), np.inf)
+    distance = np.full((shape.count, len(shared)), inf)
     for index in np.flatnonzero(holds[:, shared].any(axis=1)):
         mine = holds[index, shared]
         distance[index, mine] = shape.segment_distance(int(index), points[shared[mine]])
@@ -90,7 +92,7 @@ class Samples(NamedTuple):
     labels: Labels
 
 
-Boxes = Float[np.ndarray, "s 2 d"]
+Boxes = Float[ndarray, "s 2 d"]
 Label = Callable[[Places], Labels]
 
 
@@ -101,7 +103,7 @@ def extended_boxes(shape: Shape, margin: float = 0.5) -> Boxes:
     return np.stack([boxes[:, 0] - reach, boxes[:, 1] + reach], axis=1)
 
 
-def joint_box(shape: Shape) -> Float[np.ndarray, "2 d"]:
+def joint_box(shape: Shape) -> Float[ndarray, "2 d"]:
     """Box of all segments together, not extended: the paper's "joint boundaries of all segments"."""
     low, high = shape.boxes().swapaxes(0, 1)
     return np.stack([low.min(axis=0), high.max(axis=0)])
@@ -167,18 +169,18 @@ def sample_queries(shape: Shape, settings: SamplingConfig, rng: Generator) -> Sa
 class _Draws:
     """The draws for one segment, up to the one at which both sides hold ``need``."""
 
-    def __init__(self, index: int, box: Float[np.ndarray, "2 d"], need: int, outside: np.ndarray, seed: np.ndarray):
+    def __init__(self, index: int, box: Float[ndarray, "2 d"], need: int, outside: ndarray, seed: ndarray):
         self.index, self.box, self.need, self.outside = index, box, need, outside
         self.rng = default_rng(seed)
         self.points = np.empty((0, box.shape[1]))
-        self.labels = np.empty(0, dtype=np.uint8)
+        self.labels = np.empty(0, np.uint8)
         self.fewest = 0
 
-    def sides(self) -> tuple[np.ndarray, np.ndarray]:
+    def sides(self) -> tuple[ndarray, ndarray]:
         """Rows of the draws inside the segment and of those that count as outside, in drawing order."""
         return np.flatnonzero(self.labels == self.index + 1), np.flatnonzero(self.outside[self.labels])
 
-    def next_batch(self) -> Float[np.ndarray, "b d"]:
+    def next_batch(self) -> Float[ndarray, "b d"]:
         """About as many draws as are still missing, from the hit rate so far; at most four times those made."""
         drawn = len(self.points)
         size = _FIRST_BATCH * self.need
@@ -186,7 +188,7 @@ class _Draws:
             size = min(int(1.2 * (self.need - self.fewest) * drawn / (self.fewest + 1)) + 1, 4 * drawn)
         return _uniform(self.box, min(size, _LARGEST_BATCH, MAX_DRAWS - drawn), self.rng)
 
-    def add(self, points: Float[np.ndarray, "b d"], labels: UInt8[np.ndarray, " b"]) -> bool:
+    def add(self, points: Float[ndarray, "b d"], labels: UInt8[ndarray, " b"]) -> bool:
         """Take a batch; True when the segment is done, and then drop what was drawn after its last draw."""
         self.points, self.labels = np.concatenate([self.points, points]), np.concatenate([self.labels, labels])
         inside, outside = self.sides()
@@ -241,7 +243,7 @@ def _sort(
     return _join([(d, rows[_nearest_rows(shape, d.index, d.points[rows], keep)]) for d, rows in draws])
 
 
-def _nearest_rows(shape: Shape, index: int, points: Places, keep: int) -> np.ndarray:
+def _nearest_rows(shape: Shape, index: int, points: Places, keep: int) -> ndarray:
     """Rows of the ``keep`` points nearest to segment ``index``'s surface, in the order given; exact.
 
     Distances dominate data generation, so most are avoided: a point is no nearer to the surface than to its box, and a
@@ -254,7 +256,7 @@ def _nearest_rows(shape: Shape, index: int, points: Places, keep: int) -> np.nda
     low, high = shape.boxes()[index]
     to_box = norm(np.maximum(np.maximum(low - points, points - high), 0.0), axis=1)
     known = np.argsort(to_box, kind="stable")[: 2 * keep]
-    distance = np.full(len(points), np.inf)
+    distance = np.full(len(points), inf)
     distance[known] = shape.segment_distance(index, points[known])
     rest = np.flatnonzero(np.isinf(distance) & (to_box <= _keep_th(distance, keep)))
     if len(rest):
@@ -274,11 +276,11 @@ def _keep_th(distance: Values, keep: int) -> float:
     return float(np.partition(distance, keep - 1)[keep - 1])
 
 
-def _join(sides: list[tuple[_Draws, np.ndarray]]) -> Samples:
+def _join(sides: list[tuple[_Draws, ndarray]]) -> Samples:
     points, labels = zip(*((draws.points[rows], draws.labels[rows]) for draws, rows in sides), strict=True)
     return Samples(np.concatenate(points), np.concatenate(labels))
 
 
-def _uniform(box: Float[np.ndarray, "2 d"], count: int, rng: Generator) -> Places:
+def _uniform(box: Float[ndarray, "2 d"], count: int, rng: Generator) -> Places:
     low, high = box
     return low + rng.random((count, len(low))) * (high - low)

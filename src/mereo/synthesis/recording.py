@@ -18,11 +18,13 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from math import pi
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator
 from PIL import Image
@@ -71,7 +73,7 @@ def walk(scene: Scene, seed: int, times_s: Values, change_s: float) -> list[Play
     """
     start = random_state(scene, seed)
     path = _Path.of(scene, start, seed, times_s / change_s)
-    states, places = list[Played](), list[np.ndarray]()
+    states, places = list[Played](), list[ndarray]()
     step = np.diff(times_s, prepend=0.0) * FASTEST * rest_frame(scene.rest)[1]
     tries = 0
     while len(states) < len(times_s):
@@ -93,7 +95,7 @@ def walk(scene: Scene, seed: int, times_s: Values, change_s: float) -> list[Play
     return states
 
 
-def process_weights(times: Values) -> Float[np.ndarray, "n k"]:
+def process_weights(times: Values) -> Float[ndarray, "n k"]:
     """Weights of independent normal nodes at times, in distances between nodes; their squares sum to 1.
 
     Cubic B-splines: twice continuously differentiable, and a node is forgotten two distances away.
@@ -141,9 +143,9 @@ class _Path:
 
     start: Played
     moving: list[bool]
-    weights: Float[np.ndarray, "n k"]
-    first: Float[np.ndarray, " d"]
-    nodes: Float[np.ndarray, "k d"]
+    weights: Float[ndarray, "n k"]
+    first: Float[ndarray, " d"]
+    nodes: Float[ndarray, "k d"]
     rng: Generator
     reach: float = 1.0
 
@@ -159,7 +161,7 @@ class _Path:
         nodes += np.outer(weights[0], first - weights[0] @ nodes)
         return cls(start, moving, weights, first, nodes, rng)
 
-    def shares(self, i: int) -> dict[Key, Float[np.ndarray, " m"]]:
+    def shares(self, i: int) -> dict[Key, Float[ndarray, " m"]]:
         """Shares of all draws at time i."""
         z = self.weights[i] @ self.nodes
         z = np.sqrt(1 - self.reach**2) * self.first + self.reach * z if self.reach < 1 else z
@@ -243,16 +245,16 @@ def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed:
         yield Moment(float(time_s), played, mesh, T_world_camera, seen)
 
 
-def _camera_aims(workspace: Workspace, times: Values, rng: Generator) -> list[Callable[[np.ndarray], np.ndarray]]:
+def _camera_aims(workspace: Workspace, times: Values, rng: Generator) -> list[Callable[[ndarray], ndarray]]:
     """Poses by what they aim at, on a smooth way near a random one; ``times`` are in units of the change."""
     weights = process_weights(times)
     first = rng.normal(size=3)
     z = weights @ rng.normal(size=(weights.shape[1], 3))
     mixed = ndtr(np.sqrt(1 - CAMERA_REACH**2) * first[:2] + CAMERA_REACH * z[:, :2])
-    lowest = np.cos(min(workspace.aperture_rad / 2, np.pi))
+    lowest = np.cos(min(workspace.aperture_rad / 2, pi))
     cosine, (near, far) = lowest + mixed[:, 0] * (1 - lowest), workspace.distance
-    azimuth = 2 * np.pi * ndtr(first[2]) + CAMERA_TURN_RAD * z[:, 2]
-    roll = rng.uniform(0.0, 2 * np.pi) if workspace.any_roll else 0.0
+    azimuth = 2 * pi * ndtr(first[2]) + CAMERA_TURN_RAD * z[:, 2]
+    roll = rng.uniform(0.0, 2 * pi) if workspace.any_roll else 0.0
     distance = near + mixed[:, 1] * (far - near)
     return [
         partial(workspace.pose, cosine=float(c), azimuth_rad=float(a), distance=float(d), roll_rad=roll)
@@ -385,7 +387,7 @@ def write_recording(
         counts=np.array([(len(segment.vertices), len(segment.faces)) for segment in rest.segments]),
         T_world_camera=poses,
         draws=draws,
-        sizes=np.array(sizes, dtype=np.int64),
+        sizes=np.array(sizes, np.int64),
     )
     index = {
         "format": 1,

@@ -5,10 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, UInt8
+from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from mereo.geometry.brief import as_exact_as
-from mereo.geometry.mesh import Color, Segment, SegmentedMesh, vertex_normals
+from mereo.geometry.conventions import Names
+from mereo.geometry.mesh import Colors, Segment, SegmentColors, SegmentedMesh, vertex_normals
 from mereo.geometry.radii import STOPS, Radii, between_stops, describe_level
 from mereo.geometry.transforms import Points, Values
 from mereo.models.trained import Answer
@@ -42,13 +44,13 @@ _HEX = (
 )
 """Its 256 colours, six digits each."""
 
-TABLE: UInt8[np.ndarray, "256 3"] = np.frombuffer(bytes.fromhex(_HEX), dtype=np.uint8).reshape(256, 3)
+TABLE: UInt8[ndarray, "256 3"] = np.frombuffer(bytes.fromhex(_HEX), np.uint8).reshape(256, 3)
 """Colours from the least number to the greatest; read-only."""
 
 
-def viridis(values: Float[np.ndarray, "*shape"]) -> UInt8[np.ndarray, "*shape 3"]:
+def viridis(values: Float[ndarray, "*shape"]) -> UInt8[ndarray, "*shape 3"]:
     """Colour of each value between 0 (dark) and 1 (bright); what lies outside has that of the nearer end, NaN of 0."""
-    index = np.clip(np.nan_to_num(np.asarray(values, dtype=np.float64)) * len(TABLE), 0, len(TABLE) - 1)
+    index = np.clip(np.nan_to_num(np.asarray(values, float)) * len(TABLE), 0, len(TABLE) - 1)
     return TABLE[index.astype(np.int64)]
 
 
@@ -67,10 +69,10 @@ class ColorScale:
     title: str
     low: float
     high: float
-    stops: tuple[Color, ...]
-    words: tuple[str, ...]
+    stops: SegmentColors
+    words: Names
 
-    def colors(self, values: Values) -> UInt8[np.ndarray, "n 3"]:
+    def colors(self, values: Values) -> Colors:
         """Colours (red, green, blue) of numbers, linear between the stops; NaN is grey."""
         mixed = between_stops((values - self.low) / (self.high - self.low), self.stops)
         return np.where(np.isnan(values)[:, None], 128.0, mixed).round().astype(np.uint8)
@@ -85,7 +87,7 @@ CONFIDENCE = ColorScale(
 )
 
 
-def distance_scale(values: Sequence[Float[np.ndarray, " _"]], unit: str) -> ColorScale:
+def distance_scale(values: Sequence[Float[ndarray, " _"]], unit: str) -> ColorScale:
     """Scale for ``observed_distance`` of all segments; it ends at the largest but for a twentieth of the vertices."""
     joint = np.concatenate([*values, np.zeros(1)])
     high = max(float(np.quantile(joint, 0.95)), 1e-9)
@@ -102,7 +104,7 @@ def radius_scale(radii: Radii, unit: str) -> ColorScale:
     return ColorScale(title, 0.0, high, STOPS, (*less, f"\N{GREATER-THAN OR EQUAL TO} {most}{unit}"))
 
 
-def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[np.ndarray, " _"]]:
+def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[ndarray, " _"]]:
     """Confidence of each surface at every vertex, 0 to 1: how decidedly the model changes its mind across it.
 
     On the surface itself the winner's probability says nothing: it is where the winner changes, so that two classes
@@ -121,15 +123,15 @@ def confidence(surfaces: SegmentedMesh, ask: Ask) -> list[Float[np.ndarray, " _"
     return [_confidence(s, labels, ask, step) for s, labels in zip(surfaces.segments, held, strict=True)]
 
 
-def _confidence(segment: Segment, labels: list[int], ask: Ask, step: float) -> Float[np.ndarray, " v"]:
+def _confidence(segment: Segment, labels: list[int], ask: Ask, step: float) -> Float[ndarray, " v"]:
     if len(segment.vertices) == 0:
         return np.zeros(0)
     offset = step * vertex_normals(segment)
     inside, outside = (ask(segment.vertices + sign * offset).probability[:, labels].sum(axis=1) for sign in (-1, 1))
-    return np.clip(inside - outside, 0.0, 1.0).astype(np.float64)
+    return np.clip(inside - outside, 0.0, 1.0).astype(float)
 
 
-def observed_distance(surfaces: SegmentedMesh, observed: Points) -> list[Float[np.ndarray, " _"]]:
+def observed_distance(surfaces: SegmentedMesh, observed: Points) -> list[Float[ndarray, " _"]]:
     """Distance from every vertex to the nearest observed point: what is far from all of them is a guess."""
     tree = cKDTree(observed)
     return [tree.query(s.vertices)[0] if len(s.vertices) else np.zeros(0) for s in surfaces.segments]

@@ -89,7 +89,7 @@ def depth_to_rgb(image: DepthImage, limits: Range | None = None) -> Picture:
     seen = image.depth[image.valid]
     near, far = limits or ((float(seen.min()), float(seen.max())) if len(seen) else (0.0, 1.0))
     nearness = 1 - (image.depth - near) / max(far - near, 1e-12)
-    return np.where(image.valid[..., None], viridis(nearness), np.asarray(MISSING, dtype=np.uint8))
+    return np.where(image.valid[..., None], viridis(nearness), np.asarray(MISSING, np.uint8))
 
 
 def enlarge(picture: Picture, width: int) -> Picture:

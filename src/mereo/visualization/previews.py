@@ -8,12 +8,12 @@ from dataclasses import replace
 
 import numpy as np
 import trimesh
-from jaxtyping import Float
 from numpy.linalg import norm
 
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import Triple
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.transforms import Corners, Points
+from mereo.geometry.transforms import Corners, Points, Vector, box_of
 from mereo.io.errors import AnyPath
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
@@ -28,7 +28,7 @@ from mereo.visualization.contact_sheets import (
     legend,
     save_png,
 )
-from mereo.visualization.renderer import Vector, Viewpoint, shade, shaded_canvas
+from mereo.visualization.renderer import Viewpoint, shade, shaded_canvas
 
 CAMERA_VIEWS = {
     "as the camera sees it": ((0.0, 0.0, 1.0), (0.0, -1.0, 0.0)),
@@ -64,7 +64,7 @@ def render_cloud_and_segments(
 
 
 def points_on_segments(
-    points: Points, surfaces: SegmentedMesh, sides: Sequence[tuple[Vector, Vector]], size: int
+    points: Points, surfaces: SegmentedMesh, sides: Sequence[tuple[Triple, Triple]], size: int
 ) -> list[Picture]:
     """Pictures of the segments with the observed points on them as dark dots, one from each side.
 
@@ -87,19 +87,19 @@ def points_on_segments(
 
 def _joint_bounds(points: Points, solid: SegmentedMesh) -> Corners:
     joint = np.concatenate([points, *(segment.vertices for segment in solid.segments if len(segment.faces))])
-    return np.stack([joint.min(axis=0), joint.max(axis=0)])
+    return box_of(joint)
 
 
 # --- states of one scene ---------------------------------------------------------------------------------------------
 
 
-def preview_scene(scene: Scene, path: AnyPath, seed: int = 0, states: int = 9) -> None:
-    """Write ``preview_states`` of random states of a scene; state i comes from (seed, i) alone."""
+def preview_scene(scene: Scene, path: AnyPath, seed: int) -> None:
+    """Write ``preview_states`` of nine random states of a scene; state i comes from (seed, i) alone."""
     settings = GenerateConfig()
-    views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(states)]
+    views = [sample_view(scene, settings, example_rng(seed, index)) for index in range(9)]
     # scenes in code that are seen from all around state no axis; their meshes are mostly y up
     up = (0.0, 1.0, 0.0) if scene.workspace.all_around and scene.file is None else scene.workspace.axis
-    preview_states(path, views, f"{scene.name}: {states} random states", up=up)
+    preview_states(path, views, f"{scene.name}: 9 random states", up=up)
 
 
 def preview_states(
@@ -107,10 +107,9 @@ def preview_states(
     views: Sequence[View],
     title: str = "",
     size: int = 220,
-    across: int = 3,
-    up: Vector = (0.0, 0.0, 1.0),
+    up: Triple = (0.0, 0.0, 1.0),
 ) -> None:
-    """Write a sheet of states: for each, what the camera sees, the state from a fixed side, the depth image.
+    """Write a sheet of states, three in a row: what the camera sees, the state from a fixed side, the depth image.
 
     The fixed side is the same world direction for all states; an arrow shows where the camera looks from.
 
@@ -119,21 +118,20 @@ def preview_states(
         views: the states, see ``mereo.synthesis.examples.sample_view``.
         title: one line above.
         size: width of each picture in pixels.
-        across: states in a row.
         up: the world direction that is upwards in the fixed side's pictures.
     """
-    images: list[Picture] = []
-    captions: list[str] = []
+    images = list[Picture]()
+    captions = list[str]()
     for number, view in enumerate(views, start=1):
         camera = view.depth.camera
         height = size * camera.height // camera.width
         images += [shade(view.mesh, Viewpoint.through(camera), (size, height)), _from_side(view, size, up)]
         images.append(enlarge(depth_to_rgb(view.depth), size))
         captions += [f"{number}: camera", "fixed side, arrow = camera", f"depth, {int(view.depth.valid.sum())} pixels"]
-    save_png(path, contact_sheet(images, captions, 3 * across, title))
+    save_png(path, contact_sheet(images, captions, 9, title))
 
 
-def _from_side(view: View, size: int, up: Vector) -> Picture:
+def _from_side(view: View, size: int, up: Triple) -> Picture:
     world = view.mesh.transformed(view.T_world_camera)
     center = world.bounds.mean(axis=0)
     radius = float(norm(world.bounds[1] - world.bounds[0])) / 2
@@ -148,7 +146,7 @@ def _from_side(view: View, size: int, up: Vector) -> Picture:
     return shade(shown, replace(side, half_size=1.4 * radius), (size, size))
 
 
-def _arrow(center: Float[np.ndarray, "3"], toward: Float[np.ndarray, "3"], radius: float) -> Segment:
+def _arrow(center: Vector, toward: Vector, radius: float) -> Segment:
     """A cone on a thin shaft outside the object, pointing at it along the camera's line of sight."""
     # (thickness, distance from the centre), both in radii, from the tip to the end of the shaft
     profile = ((0.0, 0.85), (0.08, 1.03), (0.03, 1.03), (0.03, 1.35), (0.0, 1.35))

@@ -22,6 +22,7 @@ from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int, UInt16
+from numpy import ndarray
 from PIL import Image
 from scipy.spatial import cKDTree
 
@@ -29,12 +30,12 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import Explanation
 from mereo.geometry.brief import rounded
 from mereo.geometry.camera import DepthImage, PointCloud
-from mereo.geometry.conventions import Names
+from mereo.geometry.conventions import Facts, Names
 from mereo.geometry.downsampling import random_subset
-from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh
+from mereo.geometry.mesh import Color, Segment, SegmentColors, SegmentedMesh
 from mereo.geometry.radii import Radii, describe_level
 from mereo.geometry.subdivision import split_at_creases
-from mereo.geometry.transforms import Indices, Labels, Matrix, Points, Vector
+from mereo.geometry.transforms import Indices, Labels, Matrix, Points, Subset, Vector, box_of
 from mereo.io.atomic_files import JsonObject, atomic_file
 from mereo.io.errors import AnyPath
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
@@ -54,9 +55,6 @@ CLOUD_POINTS = 60_000
 """Most points of the cloud that the page shows."""
 
 STEPS = 65535
-
-Facts = Mapping[str, Any]
-"""Summary of a result, or a block of it; every key may be missing."""
 
 
 # --- written ----------------------------------------------------------------------------------------------------------
@@ -160,15 +158,15 @@ class Report:
 
 def _joint_bounds(points: Points, surfaces: SegmentedMesh) -> tuple[Vector, Vector]:
     everything = np.concatenate([points, *(segment.vertices for segment in surfaces.segments)])
-    low, high = everything.min(axis=0), everything.max(axis=0)
+    low, high = box_of(everything)
     return low, np.maximum(high, low + 1e-9 * max(1.0, float(np.abs(low).max())))
 
 
-def _quantize(points: Points, low: Vector, high: Vector) -> UInt16[np.ndarray, "n 3"]:
+def _quantize(points: Points, low: Vector, high: Vector) -> UInt16[ndarray, "n 3"]:
     return np.rint((points - low) / (high - low) * STEPS).astype("<u2")
 
 
-def _base64(array: np.ndarray) -> str:
+def _base64(array: ndarray) -> str:
     return base64.b64encode(array.tobytes()).decode("ascii")
 
 
@@ -191,13 +189,13 @@ def cluster(segment: Segment, cell: float) -> Segment:
     inverse = _same(np.floor((segment.vertices - segment.vertices.min(axis=0)) / cell).astype(np.int64))[1]
     count = np.bincount(inverse)
     sums = [np.bincount(inverse, weights=segment.vertices[:, axis], minlength=len(count)) for axis in range(3)]
-    faces: Faces = inverse[segment.faces]
+    faces = inverse[segment.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     first = _same(np.sort(faces, axis=1))[0]
     return Segment(segment.name, segment.color, np.stack(sums, axis=1) / count[:, None], faces[np.sort(first)])
 
 
-def _same(rows: Int[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Indices]:
+def _same(rows: Int[ndarray, "n 3"]) -> tuple[Subset, Indices]:
     """First index of each different row, and for each row which one it is; packed, because sorting rows is slow."""
     base = int(rows.max(initial=0)) + 1
     packed = (rows[:, 0] * base + rows[:, 1]) * base + rows[:, 2]
@@ -388,9 +386,7 @@ def _warnings(summary: Facts, verdict: Trust) -> list[str]:
 def _row(segment: Facts, unit: Unit) -> list[Any]:
     centre, volume = segment.get("centroid"), _number(segment.get("volume"))
     radius = _number(segment.get("centroid_radius95"))
-    words = (
-        DASH if centre is None or _number(centre[0]) is None else unit.place(np.asarray(centre, dtype=float), radius)
-    )
+    words = DASH if centre is None or _number(centre[0]) is None else unit.place(np.asarray(centre, float), radius)
     place, sign, off = words.partition(" ± ")
     # a narrow page breaks these lines at their plain spaces
     place = GAP.join(place.split()) + (f"{GAP} ±\N{NO-BREAK SPACE}{off}" if sign else "")
@@ -408,7 +404,7 @@ UNEXPLAINED = 255
 MOST = 254
 """Byte of the point that decides a centroid most."""
 
-WEIGHTS: tuple[Color, ...] = ((150, 156, 168), (40, 120, 255), (255, 176, 0))
+WEIGHTS: SegmentColors = ((150, 156, 168), (40, 120, 255), (255, 176, 0))
 """Colours of observed points from those that decide nothing of a place to those that decide most of it; seen on dark
 and on light."""
 
@@ -484,7 +480,7 @@ class WrittenReport:
     cloud: PointCloud | None
     count: int
     depth: Picture | None
-    ends: tuple[str, ...]
+    ends: Names
     unit_known: bool
 
 
@@ -498,7 +494,7 @@ def read_report(path: Path) -> WrittenReport | None:
         return None
     try:
         page = json.loads(text)
-        words, low, high = page["words"], np.array(page["low"], dtype=float), np.array(page["high"], dtype=float)
+        words, low, high = page["words"], np.array(page["low"], float), np.array(page["high"], float)
         steps = np.frombuffer(base64.b64decode(page["cloud"]["positions"]), "<u2").reshape(-1, 3)
         level, *sentences = words["trust"]
         if level not in VERDICTS:

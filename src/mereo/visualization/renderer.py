@@ -6,12 +6,15 @@ camera's.
 
 from dataclasses import dataclass
 from itertools import permutations
+from math import inf
 
 import numpy as np
 from jaxtyping import Float, Int, UInt8
+from numpy import ndarray
 from scipy.sparse import csr_array
 
-from mereo.geometry.camera import Camera, Size
+from mereo.geometry.camera import Camera, PixelValues, Size
+from mereo.geometry.conventions import Pair
 from mereo.geometry.mesh import Color, Faces, SegmentedMesh, Vertices
 from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import (
@@ -59,7 +62,7 @@ class Viewpoint:
         margin: float = 1.08,
     ) -> "Viewpoint":
         """Orthographic view along ``direction``, with ``up`` upwards, that shows the whole box ``bounds``."""
-        turned = look_at(np.zeros(3), np.asarray(direction, dtype=float), np.asarray(up, dtype=float))
+        turned = look_at(np.zeros(3), np.asarray(direction, float), np.asarray(up, float))
         rotation = inverse_rigid(turned)[:3, :3]
         half = np.abs(rotation[:2]) @ (bounds[1] - bounds[0]) / 2
         return cls(rigid(rotation, -rotation @ bounds.mean(axis=0)), margin * max(float(half.max()), 1e-12))
@@ -73,14 +76,14 @@ class Viewpoint:
         """Points in the view frame."""
         return transform_points(self.T_view_world, points)
 
-    def pixels(self, points_view: Points, width: int, height: int) -> Float[np.ndarray, "n 2"]:
+    def pixels(self, points_view: Points, width: int, height: int) -> Float[ndarray, "n 2"]:
         """Column and row (pixel centres at +0.5) of points in the view frame."""
         if self.camera is not None:
             return self.camera.project(points_view) * [width / self.camera.width, height / self.camera.height]
         scale = min(width, height) / (2 * self.half_size)
         return points_view[:, :2] * scale + [width / 2, height / 2]
 
-    def rays(self, width: int, height: int, back_off: float) -> tuple[np.ndarray, np.ndarray]:
+    def rays(self, width: int, height: int, back_off: float) -> tuple[ndarray, ndarray]:
         """Origins and directions (z = 1) in the view frame through every pixel centre, row by row."""
         grid_y, grid_x = np.meshgrid(np.arange(height) + 0.5, np.arange(width) + 0.5, indexing="ij")
         pixel = np.stack([grid_x.ravel(), grid_y.ravel()], axis=-1)
@@ -107,19 +110,19 @@ class Triangles:
 
     vertices: Vertices
     faces: Faces
-    colors: Float[np.ndarray, "f 3"]
-    normals: Float[np.ndarray, "f 3 3"]
-    owner: Int[np.ndarray, " f"]
+    colors: Float[ndarray, "f 3"]
+    normals: Float[ndarray, "f 3 3"]
+    owner: Int[ndarray, " f"]
 
     @classmethod
     def of(cls, mesh: SegmentedMesh, colors: list[Color] | None = None) -> "Triangles":
         """Triangles of all segments in their colours, or in ``colors``, one for each segment."""
         vertices, faces, owner = mesh.merged()
-        palette = np.asarray(mesh.colors if colors is None else colors, dtype=float).reshape(-1, 3) / 255.0
+        palette = np.asarray(mesh.colors if colors is None else colors, float).reshape(-1, 3) / 255.0
         return cls(vertices, faces, palette[owner], corner_normals(vertices, faces), owner)
 
 
-def corner_normals(vertices: Vertices, faces: Faces) -> Float[np.ndarray, "f 3 3"]:
+def corner_normals(vertices: Vertices, faces: Faces) -> Float[ndarray, "f 3 3"]:
     """Normal at each corner of each face: the mean, weighted by angle, of those faces there that no crease parts."""
     edges = [unit_rows(vertices[np.roll(faces, -k, axis=1)] - vertices[faces]) for k in (1, 2)]
     angle = np.arccos(np.clip((edges[0] * edges[1]).sum(axis=-1), -1, 1)).ravel()
@@ -138,14 +141,14 @@ class Canvas:
     """Picture in the making at ``SUPERSAMPLE`` times its size: colours in 0..1 and depth (infinite where empty)."""
 
     view: Viewpoint
-    rgb: Float[np.ndarray, "h w 3"]
-    depth: Float[np.ndarray, "h w"]
+    rgb: Float[ndarray, "h w 3"]
+    depth: PixelValues
 
     @classmethod
     def empty(cls, view: Viewpoint, size: Size) -> "Canvas":
         """Blank picture; ``size`` is (width, height) when it is finished."""
         shape = (size[1] * SUPERSAMPLE, size[0] * SUPERSAMPLE)
-        return cls(view, np.full((*shape, 3), BACKGROUND), np.full(shape, np.inf))
+        return cls(view, np.full((*shape, 3), BACKGROUND), np.full(shape, inf))
 
     def draw_triangles(self, shown: Triangles) -> None:
         """Draw triangles where they are nearer than everything drawn before."""
@@ -166,9 +169,9 @@ class Canvas:
         part = np.where(nearer, np.append(shown.owner, -1)[face], -1).reshape(height, width)
         self._outline(part)
 
-    def _outline(self, part: Int[np.ndarray, "h w"]) -> None:
+    def _outline(self, part: Int[ndarray, "h w"]) -> None:
         """Darken pixels next to another part or next to the background."""
-        edge = np.zeros(part.shape, dtype=bool)
+        edge = np.zeros(part.shape, bool)
         for axis in (0, 1):
             for step in (1, -1):
                 edge |= part != np.roll(part, step, axis=axis)
@@ -189,7 +192,7 @@ class Canvas:
         for dx, dy in ((x, y) for x in steps for y in steps if x * x + y * y <= radius * radius):
             self._put(corner + np.array([dx, dy]), z, colors[order])
 
-    def _put(self, at: Int[np.ndarray, "n 2"], z: Values, colors: Points) -> None:
+    def _put(self, at: Int[ndarray, "n 2"], z: Values, colors: Points) -> None:
         """Single pixels, ordered far to near."""
         height, width = self.depth.shape
         inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
@@ -204,7 +207,7 @@ class Canvas:
         hidden = np.isfinite(inner.depth) & (inner.depth > self.depth + 1e-6)
         self.rgb[hidden] = OUTER_OPACITY * self.rgb[hidden] + (1 - OUTER_OPACITY) * inner.rgb[hidden]
 
-    def picture(self) -> UInt8[np.ndarray, "h w 3"]:
+    def picture(self) -> UInt8[ndarray, "h w 3"]:
         """Finished picture, averaged down to the requested size."""
         height, width = (side // SUPERSAMPLE for side in self.depth.shape)
         blocks = self.rgb.reshape(height, SUPERSAMPLE, width, SUPERSAMPLE, 3)
@@ -219,15 +222,15 @@ def _cast(
 ) -> tuple[Indices, Values, Points]:
     """For each ray the first face (-1: none), the distance in lengths of its direction, barycentric weights."""
     if len(faces) == 0:
-        return np.full(len(origins), -1), np.full(len(origins), np.inf), np.zeros((len(origins), 3))
-    vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, dtype=np.int64)
+        return np.full(len(origins), -1), np.full(len(origins), inf), np.zeros((len(origins), 3))
+    vertices, faces = np.ascontiguousarray(vertices), np.ascontiguousarray(faces, np.int64)
     face, share, place = cast_rays(search_tree(vertices, faces), vertices, faces, origins, directions)
     place[face < 0] = 0.0  # else it is whatever was in memory
     weights = np.concatenate([1 - place.sum(axis=1, keepdims=True), place], axis=1)
-    return face, np.where(face >= 0, share, np.inf), weights
+    return face, np.where(face >= 0, share, inf), weights
 
 
-def enclosed(mesh: SegmentedMesh) -> set[tuple[int, int]]:
+def enclosed(mesh: SegmentedMesh) -> set[Pair]:
     """Pairs (inner, outer) of segments' indices: those declared nested, and those of which one is around the other.
 
     It is around a point where it is met from there in six directions, along the axes and against them. So it may have
@@ -251,7 +254,7 @@ def opacities(mesh: SegmentedMesh) -> list[float]:
     return [OUTER_OPACITY if index in outer else 1.0 for index in range(len(mesh.segments))]
 
 
-def _light(normal: Points, ray: Points) -> Float[np.ndarray, "n 2"]:
+def _light(normal: Points, ray: Points) -> Float[ndarray, "n 2"]:
     """Diffuse factor and added highlight: a key light from above left, a fill from the viewer, some ambient."""
     facing = np.where((normal * ray).sum(axis=1, keepdims=True) > 0, -normal, normal)
     key = unit_rows(np.array([-0.5, -0.8, -0.9]))
@@ -262,7 +265,7 @@ def _light(normal: Points, ray: Points) -> Float[np.ndarray, "n 2"]:
 
 def shade(
     mesh: SegmentedMesh, view: Viewpoint, size: Size, colors: list[Color] | None = None
-) -> UInt8[np.ndarray, "h w 3"]:
+) -> UInt8[ndarray, "h w 3"]:
     """Shaded picture of ``size`` (width, height) pixels on white, each segment in its colour (or ``colors``).
 
     Segments inside others shine through them (``enclosed``).

@@ -69,7 +69,7 @@ def summary_of(
     if answer.is_missing:
         return {**head, "pose": None, "segments": [], "tracking": answer.tracking, **facts}
     result, fit = answer.reconstruction, answer.registered
-    segments: list[JsonObject] = [
+    segments = [
         {**asdict(segment), **({} if fit is None else {"pose": fit.segment_pose(segment.label)}), "color": color}
         for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
@@ -213,7 +213,7 @@ def with_carried(surfaces: SegmentedMesh, carried: Sequence[Carried]) -> Segment
     Their names are those of their files, with that of the part where a file has several; their colours differ from the
     segments'.
     """
-    parts: list[Segment] = []
+    parts = list[Segment]()
     for item in carried:
         if isinstance(item.content, Surfaces):
             segments = item.content.mesh.segments

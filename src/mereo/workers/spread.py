@@ -30,6 +30,7 @@ from typing import Annotated, Any, TypeVar
 
 from tyro.conf import arg
 
+from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import Count, NotNegative
 from mereo.io.cores import THREAD_VARIABLES, cores, use_threads
 from mereo.io.extras import library
@@ -269,8 +270,7 @@ def choose_cluster(address: str | None, local_cpus: int = 0, task: TaskResources
 def import_ray() -> ModuleType:
     """Import Ray, which then sends no statistics; ``ImportError`` where it is not installed."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
-    ray: ModuleType = library("ray", "cluster", "--ray")
-    return ray
+    return library("ray", "cluster", "--ray")
 
 
 def task_slots(cluster: Cluster) -> int:
@@ -287,7 +287,7 @@ def connect(cluster: Cluster) -> Iterator[None]:
     if ray.is_initialized():
         yield
         return
-    quiet: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.CRITICAL}
+    quiet: JsonObject = {"log_to_driver": False, "logging_level": logging.CRITICAL}
     handler = signal.getsignal(signal.SIGTERM)
     # in /tmp, as paths of sockets must be shorter than some systems' folders for temporary files allow
     with TemporaryDirectory(prefix=f"mereo-ray-{os.getpid()}-", dir="/tmp" if os.name == "posix" else None) as folder:
@@ -352,7 +352,7 @@ def _ray_pool(function: Function, cluster: Cluster) -> Iterator[Callable[[Any], 
         def submit(item: Any) -> Future[Any]:
             reference = task.remote([shared], item)
             running.add(reference)
-            future: Future[Any] = reference.future()
+            future = reference.future()
             future.add_done_callback(lambda _: running.discard(reference))
             return future
 
@@ -370,7 +370,7 @@ _loaded = dict[str, Function]()
 def _apply_in_task(shared: list[Any], item: Any) -> Any:
     """Task: the result for an item. ``shared`` holds a reference, as Ray would unpickle a value for each task."""
     (reference,) = shared
-    key: str = reference.hex()
+    key = reference.hex()
     if key not in _loaded:
         function, cluster, folder, path = import_ray().get(reference)
         use_threads(cluster.cpus)

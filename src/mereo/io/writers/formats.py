@@ -1,14 +1,15 @@
 """Table of formats: what ``--formats`` writes, and with which function."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float32
 
+from mereo.geometry.conventions import Facts
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
@@ -49,7 +50,7 @@ class Results:
     frame_rotation: Matrix
     unit_m: float = 1.0
     millimetres: bool = False
-    summary: Mapping[str, Any] = field(default_factory=dict)
+    summary: Facts = field(default_factory=dict)
     radii: Radii | None = None
 
     @property

@@ -5,6 +5,7 @@ import struct
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
+from numpy import ndarray
 from numpy.linalg import norm
 
 from mereo.geometry.conventions import CloudAxes
@@ -107,7 +108,7 @@ class _Arrays:
     def __init__(self) -> None:
         self.chunks, self.views, self.accessors = list[bytes](), list[JsonObject](), list[JsonObject]()
 
-    def add(self, values: Shaped[np.ndarray, "n k"], kind: str) -> int:
+    def add(self, values: Shaped[ndarray, "n k"], kind: str) -> int:
         """Number of the accessor of vertices' attributes, as single floats, or of faces' corners."""
         is_faces = values.dtype.kind == "i"
         component, target = (5125, 34963) if is_faces else (5126, 34962)
@@ -122,13 +123,13 @@ class _Arrays:
 
 
 def _material(segment: Segment, opaque: bool) -> JsonObject:
-    color = [*_linear(np.array(segment.color, dtype=np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
+    color = [*_linear(np.array(segment.color, np.uint8)).round(6).tolist(), 1.0 if opaque else OUTER_OPACITY]
     surface = {"baseColorFactor": color, "metallicFactor": 0.0, "roughnessFactor": 0.7}
     material = {"name": segment.name, "doubleSided": True, "pbrMetallicRoughness": surface}
     return material if opaque else {**material, "alphaMode": "BLEND"}
 
 
-def _linear(srgb: UInt8[np.ndarray, "*n 3"]) -> PointArray:
+def _linear(srgb: UInt8[ndarray, "*n 3"]) -> PointArray:
     """Linear light of screen colours (glTF 2.0, section 3.9.2)."""
     share = srgb / 255.0
     return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)

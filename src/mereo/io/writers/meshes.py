@@ -12,11 +12,11 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from jaxtyping import UInt8
+from numpy import ndarray
 from numpy.linalg import norm
 
 from mereo.geometry.labels import SegmentedCloud
-from mereo.geometry.mesh import Color, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
+from mereo.geometry.mesh import Color, Colors, Faces, Segment, SegmentedMesh, connected, edge_uses, three_cornered
 from mereo.geometry.radii import Radii
 from mereo.geometry.transforms import Points
 from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, write_file
@@ -89,10 +89,10 @@ def write_segments_ply(path: AnyPath, surfaces: SegmentedMesh, radii: Radii | No
     """
     with_faces(surfaces)
     positions, faces, owner = surfaces.merged()
-    colors = np.array(surfaces.colors, dtype=np.uint8)
+    colors = np.array(surfaces.colors, np.uint8)
     vertex_owner = np.repeat(np.arange(len(colors)), [len(segment.vertices) for segment in surfaces.segments])
     corners = {"count": ("u1", np.full(len(faces), 3)), "vertex_indices": ("i4", faces)}
-    sure: Columns = {} if radii is None else {"radius95": ("f4", np.concatenate(radii.vertices))}
+    sure = {} if radii is None else {"radius95": ("f4", np.concatenate(radii.vertices))}
     vertices = _records(
         _positions(positions) | _colors(colors[vertex_owner]) | {"label": ("u1", vertex_owner + 1)} | sure
     )
@@ -105,7 +105,7 @@ def write_segments_ply(path: AnyPath, surfaces: SegmentedMesh, radii: Radii | No
 
 def write_points_ply(path: AnyPath, cloud: SegmentedCloud) -> None:
     """Write the observed points with ``label``, its colour, and a network's ``confidence`` and ``occupancy``."""
-    colors = np.array(cloud.colors, dtype=np.uint8)[cloud.labels - 1]
+    colors = np.array(cloud.colors, np.uint8)[cloud.labels - 1]
     sure = {name: ("f4", values) for name, values in cloud.chances.items()}
     vertices = _records(_positions(cloud.points) | _colors(colors) | {"label": ("u1", cloud.labels)} | sure)
     _write(path, _comments(cloud.names, cloud.colors), {"vertex": vertices})
@@ -116,7 +116,7 @@ def write_positions_ply(path: AnyPath, points: Points, comment: str = "") -> Non
     _write(path, [comment] if comment else [], {"vertex": _records(_positions(points))})
 
 
-Columns = dict[str, tuple[str, np.ndarray]]
+Columns = dict[str, tuple[str, ndarray]]
 """Type and values of each property, in the order of the file."""
 
 
@@ -124,7 +124,7 @@ def _positions(points: Points) -> Columns:
     return {axis: ("f4", points[:, k]) for k, axis in enumerate("xyz")}
 
 
-def _colors(colors: UInt8[np.ndarray, "n 3"]) -> Columns:
+def _colors(colors: Colors) -> Columns:
     return {channel: ("u1", colors[:, k]) for k, channel in enumerate(("red", "green", "blue"))}
 
 
@@ -133,7 +133,7 @@ def _comments(names: Sequence[str], colors: Sequence[Color]) -> list[str]:
     return [f"segment {json.dumps(row)}" for row in segment_table(names, colors)]
 
 
-def _records(columns: Columns) -> np.ndarray:
+def _records(columns: Columns) -> ndarray:
     fields = [(name, f"<{kind}", values.shape[1:]) for name, (kind, values) in columns.items()]
     records = np.zeros(len(next(iter(columns.values()))[1]), np.dtype(fields))
     for name, (_, values) in columns.items():
@@ -141,7 +141,7 @@ def _records(columns: Columns) -> np.ndarray:
     return records
 
 
-def _write(path: AnyPath, comments: list[str], elements: dict[str, np.ndarray]) -> None:
+def _write(path: AnyPath, comments: list[str], elements: dict[str, ndarray]) -> None:
     types = {"u1": "uchar", "i4": "int", "f4": "float"}
     lines = ["ply", "format binary_little_endian 1.0", "comment written by mereo", *(f"comment {c}" for c in comments)]
     for element, records in elements.items():
@@ -200,13 +200,13 @@ def _materials(solid: list[tuple[int, Segment]], names: list[str], opaque: tuple
 # --- STL --------------------------------------------------------------------------------------------------------------
 
 
-def write_segments_stl(directory: AnyPath, surfaces: SegmentedMesh, force: bool = False) -> None:
+def write_segments_stl(directory: AnyPath, surfaces: SegmentedMesh) -> None:
     """Write a new directory of ``1-head.stl``, ``2-left-ear.stl``, ...: label and name of each segment with faces.
 
     Positions are float32. Raises as ``new_directory``, and ``ValueError`` where no segment has faces.
     """
     solid = with_faces(surfaces)
-    with new_directory(directory, force) as partial:
+    with new_directory(directory) as partial:
         for label, segment in solid:
             (partial / stl_name(label, segment.name)).write_bytes(_stl(segment))
 
@@ -226,7 +226,7 @@ def stl_name(label: int, name: str) -> str:
 def _stl(segment: Segment) -> bytes:
     """File as trimesh writes it, but for its header: the name, where it is not too long for that."""
     mesh = trimesh.Trimesh(segment.vertices, segment.faces, process=False)
-    content: bytes = trimesh.exchange.stl.export_stl(mesh)
+    content = trimesh.exchange.stl.export_stl(mesh)
     text = STL_NAME + segment.name.encode("utf-8")
     header = text if len(text) <= 80 and segment.name.isprintable() else b"written by mereo"
     return header.ljust(80) + content[80:]

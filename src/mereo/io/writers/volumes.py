@@ -20,7 +20,9 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
+from numpy import ndarray
 
+from mereo.geometry.conventions import Texts
 from mereo.geometry.labels import LabelGrid, SegmentedCloud
 from mereo.geometry.mesh import Color
 from mereo.geometry.transforms import Transform, Vector
@@ -49,7 +51,7 @@ compressor="vtkZLibDataCompressor">
 """
 
 
-def write_labels_npz(path: AnyPath, grid: LabelGrid, radii: Float32[np.ndarray, "x y z"] | None = None) -> None:
+def write_labels_npz(path: AnyPath, grid: LabelGrid, radii: Float32[ndarray, "x y z"] | None = None) -> None:
     """Write a label grid for numpy: the arrays ``labels``, ``origin``, ``spacing`` and ``names``.
 
     Voxel [i, j, k] is centred at ``origin + [i, j, k] * spacing``, in the input's frame and units. ``names[k]`` is the
@@ -63,8 +65,8 @@ def write_labels_npz(path: AnyPath, grid: LabelGrid, radii: Float32[np.ndarray, 
         np.savez_compressed(
             partial,
             labels=grid.labels,
-            origin=np.asarray(grid.origin, dtype=np.float64),
-            spacing=np.asarray(grid.spacing, dtype=np.float64),
+            origin=np.asarray(grid.origin, float),
+            spacing=np.asarray(grid.spacing, float),
             names=np.asarray(grid.names),
             **sure,
         )
@@ -84,7 +86,7 @@ def write_points_npz(path: AnyPath, cloud: SegmentedCloud) -> None:
             labels=cloud.labels,
             **chances,
             names=np.asarray(cloud.names),
-            colors=np.asarray(cloud.colors, dtype=np.uint8),
+            colors=np.asarray(cloud.colors, np.uint8),
         )
 
 
@@ -92,7 +94,7 @@ def write_labels_vti(
     path: AnyPath,
     grid: LabelGrid,
     colors: Sequence[Color],
-    radii: Float32[np.ndarray, "x y z"] | None = None,
+    radii: Float32[ndarray, "x y z"] | None = None,
 ) -> None:
     """Write VTK image data: the array ``label`` at voxel centres; field data ``segment_names``, ``segment_colors``.
 
@@ -113,7 +115,7 @@ def write_labels_vti(
     write_file(path, text)
 
 
-def _compressed(values: np.ndarray) -> str:
+def _compressed(values: ndarray) -> str:
     """Values as one zlib block; its head has the number of blocks, the bytes of each, of a partial one, and packed."""
     packed = zlib.compress(values.tobytes(order="F"))
     head = struct.pack("<4Q", 1, values.nbytes, 0, len(packed))
@@ -151,7 +153,7 @@ def write_labels_nifti(path: AnyPath, grid: LabelGrid, colors: Sequence[Color], 
     ``{"segments": [{"label", "name", "color"}, ...]}``. ``grid`` is in the input's frame and unit, of which ``unit_m``
     is the metres. Raises ``ImportError`` without the extra `medical`.
     """
-    nifti: Any = nibabel()
+    nifti = nibabel()
     image = nifti.Nifti1Image(grid.labels, RAS_FROM_LPS * _T_lps_index(grid, unit_m) + 0.0)  # no -0
     image.header.set_intent("label", name="mereo")
     table = json.dumps({"segments": segment_table(grid.names, colors)})
@@ -190,7 +192,7 @@ def write_labels_seg_nrrd(path: AnyPath, grid: LabelGrid, colors: Sequence[Color
     One layer: a voxel has one label, and inside a nested segment it is the inner one's. Slicer knows the file by its
     end, ``.seg.nrrd``. ``grid`` is in the input's frame and unit, of which ``unit_m`` is the metres.
     """
-    fields = dict[str, str]()
+    fields = Texts()
     for index, color in enumerate(colors):
         fields |= _segment_fields(grid, index, color)
     fields |= {
@@ -201,7 +203,7 @@ def write_labels_seg_nrrd(path: AnyPath, grid: LabelGrid, colors: Sequence[Color
     write_file(path, _nrrd("NRRD0004", grid.labels, _T_lps_index(grid, unit_m), fields, 9))
 
 
-def _nrrd(magic: str, values: np.ndarray, T_lps_index: Transform, fields: dict[str, str], level: int) -> bytes:
+def _nrrd(magic: str, values: ndarray, T_lps_index: Transform, fields: Texts, level: int) -> bytes:
     header = NRRD_HEADER.format(
         magic=magic,
         type={"float32": "float", "float64": "double"}.get(values.dtype.name, values.dtype.name),
@@ -214,7 +216,7 @@ def _nrrd(magic: str, values: np.ndarray, T_lps_index: Transform, fields: dict[s
     return header.encode("utf-8") + gzip.compress(little.tobytes(order="F"), level, mtime=0)
 
 
-def _segment_fields(grid: LabelGrid, index: int, color: Color) -> dict[str, str]:
+def _segment_fields(grid: LabelGrid, index: int, color: Color) -> Texts:
     """Fields of a segment. Slicer cuts layers to the extent of their first segment, so all state the grid's."""
     name = " ".join(grid.names[index].split()).replace("\\", "\\\\")  # a backslash begins an escape in NRRD values
     values = {
@@ -260,7 +262,7 @@ def write_volume(path: Path, volume: Volume, unit_m: float = 1.0) -> None:
 
 
 def _write_volume_nifti(path: Path, volume: Volume, T_ras_index: Transform) -> None:
-    nifti: Any = nibabel()
+    nifti = nibabel()
     header = volume.header if isinstance(volume.header, nifti.Nifti1Header) else None
     image = nifti.Nifti1Image(volume.values, T_ras_index, header, dtype=volume.values.dtype)
     image.header.set_data_dtype(volume.values.dtype)

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -30,6 +30,7 @@ from torch.export import Dim, ExportedProgram
 from mereo.geometry.conventions import MIN_POINTS, Names
 from mereo.io.atomic_files import new_directory, write_json
 from mereo.io.errors import AnyPath
+from mereo.models.config import ExportFormat
 from mereo.models.decoder import Code
 from mereo.models.encoders import Level
 from mereo.models.model import DENSE_FACTOR, Model
@@ -48,6 +49,10 @@ Open = Dim.DYNAMIC
 """A size that the graph leaves open; torch finds its bounds."""
 
 
+Tensors = dict[str, Tensor]
+"""Tensors by their names."""
+
+
 class EncoderGraph(nn.Module):
     """Module to trace, from a cloud to code tensors by name."""
 
@@ -55,7 +60,7 @@ class EncoderGraph(nn.Module):
         super().__init__()
         self.network = network
 
-    def forward(self, cloud: Float[Tensor, "1 n 3"]) -> dict[str, Tensor]:
+    def forward(self, cloud: Float[Tensor, "1 n 3"]) -> Tensors:
         """Code tensors of a normalized cloud in farthest-point order."""
         unused = torch.zeros_like(cloud[:, 0])  # the viewpoint: only queries look along lines of sight
         return code_tensors(self.network.encode(cloud, unused))
@@ -68,13 +73,13 @@ class QueryGraph(nn.Module):
         super().__init__()
         self.model, self.network = model, model.network
 
-    def forward(self, points: Float[Tensor, "1 q 3"], code: dict[str, Tensor]) -> dict[str, Tensor]:
+    def forward(self, points: Float[Tensor, "1 q 3"], code: Tensors) -> Tensors:
         """Answers by name at normalized points."""
         answers = self.model.respond(self.network.query(code_of(code), points), points)
         return dict(zip(ANSWERS, answers, strict=True))
 
 
-def code_tensors(code: Code) -> dict[str, Tensor]:
+def code_tensors(code: Code) -> Tensors:
     """Tensors by name that the encoder has computed; the cloud and the viewpoint are known without it."""
     tensors = {"latent1": code.latent1, "latent2": code.latent2}
     for number, level in enumerate(code.levels, start=1):
@@ -84,9 +89,9 @@ def code_tensors(code: Code) -> dict[str, Tensor]:
     return tensors
 
 
-def code_of(tensors: dict[str, Tensor]) -> Code:
+def code_of(tensors: Tensors) -> Code:
     """Code from its tensors, the inverse of ``code_tensors``; only lines of sight need cloud and viewpoint."""
-    levels: list[Level] = []
+    levels = list[Level]()
     while (name := f"centers{len(levels) + 1}") in tensors:
         levels.append(Level(tensors[name], tensors[name.replace("centers", "features")]))
     alignment = Alignment(tensors["rotation"], tensors["shift"]) if "rotation" in tensors else None
@@ -143,7 +148,7 @@ def _example_points(count: int) -> Float[Tensor, "1 n 3"]:
     return nn.functional.normalize(points, dim=-1)
 
 
-def write_graphs(graphs: Graphs, directory: Path, format: Literal["onnx", "torch"]) -> None:
+def write_graphs(graphs: Graphs, directory: Path, format: ExportFormat) -> None:
     """Write ``encoder`` and ``query``, as ``.onnx`` or, for ``torch.export.load``, as ``.pt2``."""
     inputs = {"encoder": ["cloud"], "query": ["points", *graphs.inputs]}
     outputs = {"encoder": graphs.outputs, "query": ANSWERS}
@@ -175,7 +180,7 @@ def _quiet() -> Iterator[None]:
 
 
 def export_weights(
-    weights: Model | str | Path, output: AnyPath, format: Literal["onnx", "torch"] = "onnx", force: bool = False
+    weights: Model | AnyPath, output: AnyPath, format: ExportFormat = "onnx", force: bool = False
 ) -> None:
     """Write a new directory with both graphs, ``model.json`` and, for ONNX, the runner (``mereo export``).
 

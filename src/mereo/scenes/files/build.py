@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
+from numpy import ndarray
 from numpy.linalg import norm
 
 from mereo.deformation.elastic import ElasticSampler
@@ -380,9 +381,9 @@ def _refined_surface(rest: SegmentedMesh, states: list[Deformations], limits: Ra
     return replace(rest, segments=tuple(segments))
 
 
-def _bent(ends: Float[np.ndarray, "e 2 3"], maps: list[Deformation], limits: Range) -> Bool[np.ndarray, " e"]:
+def _bent(ends: Float[ndarray, "e 2 3"], maps: list[Deformation], limits: Range) -> Bool[ndarray, " e"]:
     """Which edges a map makes a curve of, farther from its chord than the first limit, if longer than the second."""
-    result, (tolerance, shortest) = np.zeros(len(ends), dtype=bool), limits
+    result, (tolerance, shortest) = np.zeros(len(ends), bool), limits
     long = norm(ends[:, 0] - ends[:, 1], axis=1) > shortest
     for deform in maps:
         rows = np.flatnonzero(long & ~result)

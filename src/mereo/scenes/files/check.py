@@ -3,7 +3,6 @@
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
@@ -13,14 +12,14 @@ from numpy.random import Generator
 from mereo.deformation.samplers import JointSampler, RandomMotion
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera
-from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.conventions import UNITS_M, Texts
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, Overlap, examine, grid_volume, likely_unit, near, overlaps
 from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.symmetry import TOLERANCE, describe_symmetries, find_symmetries
 from mereo.geometry.transforms import inverse_rigid, longest_side
-from mereo.io.atomic_files import check_file_place, remove_abandoned, write_file
+from mereo.io.atomic_files import JsonObject, check_file_place, remove_abandoned, write_file
 from mereo.io.yaml_document import Document
 from mereo.scenes.files.build import build, read, read_segments
 from mereo.scenes.files.deformation_blocks import is_robot_joint
@@ -203,7 +202,7 @@ HEADER = """\
 """
 
 
-def _with_segment_files(document: Document, mesh: SegmentedMesh, changed: set[str]) -> tuple[str, dict[str, str]]:
+def _with_segment_files(document: Document, mesh: SegmentedMesh, changed: set[str]) -> tuple[str, Texts]:
     """Text of a scene file that says what ``document`` says with new files for changed segments, and their names.
 
     Where the segments were parts of a model or labels of a volume, all get a file of their own: one scene file takes
@@ -220,7 +219,7 @@ def _with_segment_files(document: Document, mesh: SegmentedMesh, changed: set[st
             for segment in mesh.segments
         ]
     first = next(key for key in document.data if key in KINDS)
-    data: dict[str, Any] = {}
+    data: JsonObject = {}
     for key, value in document.data.items():
         if key == first:
             data["segments"] = segments
@@ -252,7 +251,7 @@ def _report_states(scene: Scene) -> int:
     for sentence in describe_symmetries(find_symmetries(scene.rest, TOLERANCE), scene.rest.names):
         print(f"symmetry: {sentence}")
     at_rest = {frozenset((each.small, each.large)) for each in overlaps(scene.rest)}  # faults by themselves
-    worst: dict[frozenset[str], Overlap] = {}
+    worst = dict[frozenset[str], Overlap]()
     views = list[tuple[float, int]]()
     for index in range(STATES):
         rng = example_rng(0, index)
@@ -277,7 +276,7 @@ def _direction(workspace: Workspace) -> str:
     """Which way the camera takes for up."""
     if workspace.all_around:
         return "no side: the camera looks from all around"
-    axis = np.array(workspace.axis, dtype=float)
+    axis = np.array(workspace.axis, float)
     index = int(np.abs(axis).argmax())
     if np.count_nonzero(axis) == 1:
         name = f"{'' if axis[index] > 0 else '-'}{'xyz'[index]}"

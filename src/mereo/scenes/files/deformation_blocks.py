@@ -6,8 +6,9 @@ units and radians.
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from math import radians
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 from jaxtyping import Int
@@ -30,7 +31,8 @@ from mereo.deformation import samplers
 from mereo.deformation.elastic import ElasticSampler, ElasticSolid, Material, build_lattice
 from mereo.deformation.maps import unit
 from mereo.deformation.samplers import DeformationSampler
-from mereo.geometry.conventions import UNITS_M
+from mereo.geometry.conventions import UNITS_M, Texts, Triple
+from mereo.geometry.conventions import Range as Limits
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import Corners, Indices, Normalizer, Points, Values, Vector, longest_side
@@ -47,13 +49,13 @@ from mereo.scenes.scene import Workspace
 # Kinds of values that a scene file may hold, and their rules: places, directions, ranges, names, colours.
 
 
-def _ascending(value: tuple[float, float]) -> tuple[float, float]:
+def _ascending(value: Limits) -> Limits:
     if value[0] > value[1]:
         raise ValueError("it must be [least, most]")
     return value
 
 
-def _pointing(value: tuple[float, float, float]) -> tuple[float, float, float]:
+def _pointing(value: Triple) -> Triple:
     if not any(value):
         raise ValueError("it is a direction and must have a length")
     return value
@@ -61,6 +63,10 @@ def _pointing(value: tuple[float, float, float]) -> tuple[float, float, float]:
 
 MOST = 1e12
 """Largest number of a scene file: products of a few remain finite."""
+
+Item = TypeVar("Item")
+NonEmpty = Annotated[list[Item], Field(min_length=1)]
+ProperShare = Annotated[FiniteFloat, Field(ge=0, lt=1)]
 
 Number = Annotated[FiniteFloat, Field(ge=-MOST, le=MOST)]
 Byte = Annotated[int, Field(ge=0, le=255)]
@@ -125,7 +131,7 @@ class Target:
 class DeformationBlock(Block, ABC):
     """Deformation of a scene file; all have ``segments``, those that it moves, all of them where absent."""
 
-    segments: Annotated[list[Name], Field(min_length=1)] | None = None
+    segments: NonEmpty[Name] | None = None
 
     @abstractmethod
     def sampler(self, target: Target) -> DeformationSampler:
@@ -151,7 +157,7 @@ class LatticeBlock(DeformationBlock):
     type: Literal["lattice"]
     cells: tuple[Cells, Cells, Cells] | None = None
     spacing: Positive | None = None
-    strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.5
+    strength: ProperShare = 0.5
 
     @model_validator(mode="after")
     def _has_single_grid(self) -> "LatticeBlock":
@@ -179,7 +185,7 @@ class WavesBlock(DeformationBlock):
 
     type: Literal["waves"]
     wavelength: PositiveRange
-    strength: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.3
+    strength: ProperShare = 0.3
     modes: Annotated[int, Field(ge=1, le=64)] = 4
 
     def sampler(self, target: Target) -> DeformationSampler:
@@ -281,7 +287,7 @@ class JointBlock(DeformationBlock):
 
     @field_validator("angle", "slide")
     @classmethod
-    def _ascends(cls, value: tuple[float, float], info: Any) -> tuple[float, float]:
+    def _ascends(cls, value: Limits, info: Any) -> Limits:
         return value if info.data.get("follows") else _ascending(value)
 
     @model_validator(mode="after")
@@ -354,7 +360,7 @@ class HeldPlace(Block):
     radius: Positive | None = None
     direction: Direction | None = None
     points: FileName | None = None
-    nodes: Annotated[list[NonNegativeInt], Field(min_length=1)] | None = None
+    nodes: NonEmpty[NonNegativeInt] | None = None
 
     @model_validator(mode="after")
     def _has_single_kind(self) -> "HeldPlace":
@@ -383,8 +389,8 @@ class HeldPlace(Block):
             return -cKDTree(held).query(nodes)[0]
         offset = nodes - target.point(self.center)
         if self.direction is not None:
-            return np.asarray(offset @ unit(np.array(self.direction)))
-        return np.asarray((self.radius or 0.0) * target.unit - norm(offset, axis=1))
+            return offset @ unit(np.array(self.direction))
+        return (self.radius or 0.0) * target.unit - norm(offset, axis=1)
 
     def _rows(self, nodes: Points, numbers: Indices | None, target: Target) -> Int[np.ndarray, " r"]:
         """Rows of the nodes that are held one by one."""
@@ -393,7 +399,7 @@ class HeldPlace(Block):
                 points = model_points(read_points(target.folder / (self.points or ""))[:, :3])
             except (ValueError, OSError) as error:
                 raise Misfit("held", str(error)) from error
-            return np.asarray(cKDTree(nodes).query(target.placement.apply(points))[1])
+            return cKDTree(nodes).query(target.placement.apply(points))[1]
         if numbers is None:
             raise Misfit("held", "a lattice has no nodes with numbers: name the file of `tetrahedra`, or give `points`")
         unknown = np.setdiff1d(self.nodes, numbers)
@@ -435,7 +441,7 @@ class ElasticBlock(DeformationBlock):
     motion: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = SOFT
     poisson: Annotated[FiniteFloat, Field(gt=-1, lt=0.49)] = 0.4
     stiffness: dict[Name, Annotated[FiniteFloat, Field(ge=1e-3, le=1e3)]] = {}
-    held: Annotated[list[HeldPlace], Field(min_length=1)] | None = None
+    held: NonEmpty[HeldPlace] | None = None
     cells: Annotated[int, Field(ge=4, le=64)] | None = None
     tetrahedra: FileName | None = None
     modes: Annotated[int, Field(ge=1, le=150)] = 100
@@ -557,13 +563,13 @@ Deformations = Annotated[list[Annotated[AnyDeformation, Field(discriminator="typ
 """A list of deformations, told apart by their ``type``, or a word of ``WORDS``."""
 
 
-def _lengths(values: tuple[float, float], target: Target) -> tuple[float, float]:
+def _lengths(values: Limits, target: Target) -> Limits:
     """A range of lengths in scene units."""
     return values[0] * target.unit, values[1] * target.unit
 
 
-def _radians(degrees: tuple[float, float]) -> tuple[float, float]:
-    return float(np.deg2rad(degrees[0])), float(np.deg2rad(degrees[1]))
+def _radians(degrees: Limits) -> Limits:
+    return radians(degrees[0]), radians(degrees[1])
 
 
 # --- scene files ------------------------------------------------------------------------------------------------------
@@ -608,7 +614,7 @@ class FilePart(PartLook):
 class ModelPart(PartLook):
     """Segment from one or more named parts of ``model``; by default the part that is called as it is."""
 
-    parts: Annotated[list[str], Field(min_length=1)] | None = None
+    parts: NonEmpty[str] | None = None
 
 
 def _any_roll(value: object) -> object:
@@ -634,11 +640,11 @@ class CameraBlock(Block):
     def workspace(self) -> Workspace:
         """Workspace that this block describes, angles in radians."""
         return Workspace(
-            aperture_rad=float(np.deg2rad(self.aperture)),
+            aperture_rad=radians(self.aperture),
             distance=self.distance,
             axis=self.axis,
             any_roll=self.roll,
-            fov_rad=float(np.deg2rad(self.field_of_view)),
+            fov_rad=radians(self.field_of_view),
         )
 
 
@@ -649,7 +655,7 @@ class StatesBlock(Block):
     mesh: FileName | None = None
 
     @model_serializer
-    def _written(self) -> str | dict[str, str]:
+    def _written(self) -> str | Texts:
         """The path alone where there is no mesh: an object's identity in datasets is made of it."""
         return self.positions if self.mesh is None else {"positions": self.positions, "mesh": self.mesh}
 
@@ -685,9 +691,9 @@ class SceneFile(Block):
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     units: Annotated[Positive, BeforeValidator(_unit_m)]
     source: str = "the user's own"
-    segments: Annotated[list[FilePart], Field(min_length=1)] | None = None
+    segments: NonEmpty[FilePart] | None = None
     model: FileName | None = None
-    parts: Annotated[list[ModelPart], Field(min_length=1)] | None = None
+    parts: NonEmpty[ModelPart] | None = None
     robot_meshes: RobotMeshes = "visual"
     labels: FileName | Annotated[list[FileName], Field(min_length=2)] | None = None
     names: Annotated[dict[Annotated[int, Field(ge=1)], Name], Field(min_length=1)] | None = None
@@ -696,7 +702,7 @@ class SceneFile(Block):
     camera: CameraBlock = CameraBlock()
     deformations: Deformations | None = None
     states: Annotated[StatesBlock, BeforeValidator(_states)] | None = None
-    held_out: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.1
+    held_out: ProperShare = 0.1
 
     @model_validator(mode="after")
     def _moves_in_single_way(self) -> "SceneFile":

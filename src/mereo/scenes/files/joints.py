@@ -7,13 +7,16 @@ the motion leaves closed. Its range is as far as nothing collides, up to a limit
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
+from math import radians
 
 import numpy as np
 from jaxtyping import Float
-from numpy.linalg import norm
+from numpy import ndarray
+from numpy.linalg import eigh, lstsq, norm
+from numpy.random import default_rng
 
 from mereo.deformation.maps import Compose, Rigid
-from mereo.geometry.conventions import Range
+from mereo.geometry.conventions import Pair, Range, WholeNumbers
 from mereo.geometry.mesh import Segment, SegmentedMesh, area_vectors, connected, surface_points
 from mereo.geometry.mesh_check import overlaps
 from mereo.geometry.solids import search_tree
@@ -34,7 +37,7 @@ POINTS, LEAST_POINTS = 1500, 12
 PLANE_SHARE = 0.1
 """Share of a contact that has one normal before it counts as a plane; facets of a round face have less from 11 on."""
 
-SAME_NORMAL = float(np.cos(np.deg2rad(3.0)))
+SAME_NORMAL = float(np.cos(radians(3.0)))
 
 FLATTEST, LEAST_ARC, MISFIT = 0.02, 0.1, 0.05
 """Mean square cosine of a cylinder's normals with its axis at most, and of them across their main direction at least
@@ -70,7 +73,7 @@ def contacts(mesh: SegmentedMesh) -> tuple[Contact, ...]:
     reach = CLEARANCE * longest_side(mesh.bounds)
     vectors = [area_vectors(segment.vertices, segment.faces) for segment in mesh.segments]
     areas = [float(norm(each, axis=1).sum()) for each in vectors]
-    touching: list[Contact] = []
+    touching = list[Contact]()
     for pair in combinations(range(len(mesh.segments)), 2):
         first, second = sorted(pair, key=lambda index: areas[index])
         points, normals = _touching(mesh.segments[first], mesh.segments[second], reach)
@@ -86,7 +89,7 @@ def _normals(segment: Segment, face: Indices) -> Points:
 
 def _distance(points: Points, segment: Segment) -> tuple[Values, Indices]:
     """Distance of points to a surface, and the nearest face."""
-    vertices, faces = np.array(segment.vertices), np.array(segment.faces, dtype=np.int64)
+    vertices, faces = np.array(segment.vertices), np.array(segment.faces, np.int64)
     squared, face, _ = search_tree(vertices, faces).squared_distance(vertices, faces, np.ascontiguousarray(points))
     return np.sqrt(squared), face.astype(np.int64)
 
@@ -128,18 +131,18 @@ def _largest_plane(points: Points, normals: Points, reach: float) -> Flags:
     """The largest set of points of one normal and offset."""
     offsets = normals @ points.T  # of all points along each one's normal
     alike = (normals @ normals.T > SAME_NORMAL) & (np.abs(offsets - np.diag(offsets)[:, None]) < reach)
-    return np.asarray(alike[alike.sum(axis=1).argmax()])
+    return alike[alike.sum(axis=1).argmax()]
 
 
 def _longest(points: Points) -> tuple[Vector, float]:
     """Direction in which points spread most, and how far."""
-    along = np.linalg.eigh(np.cov(points.T))[1][:, -1]
+    along = eigh(np.cov(points.T))[1][:, -1]
     return along, float(np.ptp(points @ along))
 
 
 def _cylinder(first: int, second: int, points: Points, normals: Points) -> Contact | None:
     """Cylinder through points with its normals; None where they are of none."""
-    values, vectors = np.linalg.eigh(normals.T @ normals / len(normals))
+    values, vectors = eigh(normals.T @ normals / len(normals))
     if values[0] > FLATTEST or values[1] < LEAST_ARC:
         return None
     axis, across = vectors[:, 0], vectors[:, 1:]
@@ -148,7 +151,7 @@ def _cylinder(first: int, second: int, points: Points, normals: Points) -> Conta
     system = np.zeros((2 * len(points), 3))
     system[0::2, 0] = system[1::2, 1] = 1.0
     system[:, 2] = outward.ravel()
-    solution = np.linalg.lstsq(system, flat.ravel(), rcond=None)[0]
+    solution = lstsq(system, flat.ravel(), rcond=None)[0]
     center, radius = solution[:2], abs(float(solution[2]))
     misfit = norm(flat - center, axis=1) - radius
     if not np.sqrt(np.mean(misfit**2)) < MISFIT * radius:
@@ -179,7 +182,7 @@ MOST_PASSES = 8
 NARROWER, NARROWEST = 0.8, 0.2
 """Factor of the ranges that take part in a collision, and share of a joint's range below which it is given up."""
 
-PARALLEL = float(np.cos(np.deg2rad(3.0)))
+PARALLEL = float(np.cos(radians(3.0)))
 
 ROUND_TEST_RAD = 0.7
 """A part that such a turn brings onto itself does not show that it turns."""
@@ -203,7 +206,7 @@ class Joint:
 
     contact: Contact
     hinge: bool
-    moved: tuple[int, ...]
+    moved: WholeNumbers
     axis: Vector
     most: Range
     alone: Range
@@ -218,7 +221,7 @@ def proposed_joints(mesh: SegmentedMesh) -> tuple[Joint, ...]:
     """Joints of an assembly at rest, those that move least first, as a chain wants it."""
     touching = contacts(mesh)
     test = _CollisionTest(mesh)
-    joints: list[Joint] = []
+    joints = list[Joint]()
     for contact in sorted(touching, key=lambda each: each.kind):  # cylinders before planes
         if contact.kind == "other" or _held(contact, joints):
             continue
@@ -250,7 +253,7 @@ def _joint(
     axis = contact.axis if hinge else contact.along
     axis = axis * np.sign(axis[np.abs(axis).argmax()])
     closed = [(each.first, each.second) for each in touching if not _allows(each, contact, hinge, axis, reach)]
-    side = connected(np.array(closed, dtype=np.int64).reshape(-1, 2), len(mesh.segments))
+    side = connected(np.array(closed, np.int64).reshape(-1, 2), len(mesh.segments))
     if side[contact.first] == side[contact.second]:
         return None
     groups = [tuple(np.flatnonzero(side == side[index]).tolist()) for index in (contact.first, contact.second)]
@@ -296,14 +299,14 @@ class _CollisionTest:
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.mesh = mesh
         self.reach = CLEARANCE * longest_side(mesh.bounds)
-        self._known = dict[tuple[tuple[int, int], tuple[Chain, Chain]], bool]()
+        self._known = dict[tuple[Pair, tuple[Chain, Chain]], bool]()
 
     def free(self, joint: Joint, steps: Sequence[float]) -> float:
         """First of the steps, from the farthest to the nearest, over which nothing collides; 0 where there is none."""
         free = (step for step in steps if not any(self.pairs([joint], [step * share]) for share in (0.5, 1.0)))
         return next(free, 0.0)
 
-    def pairs(self, joints: Sequence[Joint], ways: Sequence[float]) -> list[tuple[int, int]]:
+    def pairs(self, joints: Sequence[Joint], ways: Sequence[float]) -> list[Pair]:
         """Indices of the segments that collide where each joint has gone its way, in degrees or the mesh's unit."""
         motions = [(joint, way) for joint, way in zip(joints, ways, strict=True) if way]
         chains = [tuple(each for each in motions if index in each[0].moved) for index in range(len(self.mesh.segments))]
@@ -370,9 +373,9 @@ def _narrowed(test: _CollisionTest, joints: Sequence[Joint]) -> tuple[Joint, ...
     return tuple(joint for joint in narrow if joint.most[1] > joint.most[0])
 
 
-def _combinations(joints: int, states: int) -> Float[np.ndarray, "states joints"]:
+def _combinations(joints: int, states: int) -> Float[ndarray, "states joints"]:
     """Shares of joints' ranges, -1 at the least and 1 at the most: corners, with some at rest, and random ones."""
-    rng = np.random.default_rng(0)
+    rng = default_rng(0)
     if 2**joints <= states // 2:
         corners = np.array(list(product((-1.0, 1.0), repeat=joints)))
     else:
@@ -384,9 +387,9 @@ def _combinations(joints: int, states: int) -> Float[np.ndarray, "states joints"
 def _blamed(
     test: _CollisionTest,
     joints: Sequence[Joint],
-    share: Float[np.ndarray, " joints"],
-    ranges: Float[np.ndarray, "joints 2"],
-) -> set[tuple[int, int]]:
+    share: Float[ndarray, " joints"],
+    ranges: Float[ndarray, "joints 2"],
+) -> set[Pair]:
     """Joints, and the side (0 for the least, 1 for the most) of their ranges, that bring segments into collision."""
     ways = (np.maximum(share, 0.0) * ranges[:, 1] + np.maximum(-share, 0.0) * ranges[:, 0]).tolist()
     return {

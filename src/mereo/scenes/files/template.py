@@ -11,6 +11,7 @@ import shlex
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import radians
 from pathlib import Path
 from textwrap import indent
 from typing import Any, NamedTuple
@@ -18,13 +19,13 @@ from typing import Any, NamedTuple
 import numpy as np
 import trimesh
 import yaml
-from numpy.linalg import norm
+from numpy.linalg import norm, svd
 from scipy.spatial import ConvexHull, QhullError
 
 from mereo.deformation.maps import moved_by, unit
 from mereo.deformation.samplers import RandomMotion, distance_from_line
 from mereo.geometry.brief import counted, listed
-from mereo.geometry.conventions import UNITS_M, Names, Range, Way
+from mereo.geometry.conventions import UNITS_M, Facts, Names, Range, Texts, Way
 from mereo.geometry.mesh import PALETTE, Segment, SegmentedMesh, palette_color, surface_points
 from mereo.geometry.mesh_check import examine, likely_unit, overlaps
 from mereo.geometry.transforms import (
@@ -38,7 +39,7 @@ from mereo.geometry.transforms import (
     longest_side,
     transform_points,
 )
-from mereo.io.atomic_files import check_file_place, write_file
+from mereo.io.atomic_files import JsonObject, check_file_place, write_file
 from mereo.io.config import MeshesConfig, RobotMeshes
 from mereo.io.robots import ROBOT_SUFFIXES, RobotJoint, is_robot, read_object_file, read_robot
 from mereo.io.volume_files import (
@@ -179,7 +180,7 @@ LEAST_BASE, LEAST_COVER = 0.08, 0.25
 """Share of the hull's area within the outline of a base, and of that outline that is surface of the object: three
 places of a rounded body are no base."""
 
-LEAST_TILT = float(np.tan(np.deg2rad(15.0)))
+LEAST_TILT = float(np.tan(radians(15.0)))
 """Slope on which the object still stands."""
 
 
@@ -239,7 +240,7 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> Flat
     if areas[on].sum() / 2 < LEAST_COVER * LEAST_BASE * hull.area:
         return None
     normal = unit(crossed[on].sum(axis=0))
-    across = np.linalg.svd(normal[None])[2][1:]
+    across = svd(normal[None])[2][1:]
     outline = ConvexHull(solid.vertices[np.unique(solid.faces[on])] @ across.T)
     center = (solid if solid.volume > 0.01 * hull.volume else hull).center_mass  # of open meshes it is nonsense
     inside = -float((outline.equations[:, :2] @ (across @ center) + outline.equations[:, 2]).max())
@@ -248,12 +249,12 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> Flat
     if share < LEAST_BASE or cover < LEAST_COVER or inside < LEAST_TILT * height:
         return None
     nearest = np.round(normal)
-    return FlatBase(nearest if np.abs(normal).max() > np.cos(np.deg2rad(3.0)) else normal, float(share))
+    return FlatBase(nearest if np.abs(normal).max() > np.cos(radians(3.0)) else normal, float(share))
 
 
 # --- the camera -------------------------------------------------------------------------------------------------------
 
-NEAR, FARTHER, MOST_VIEW_RAD = 100.0, 1.25, float(np.deg2rad(40.0))
+NEAR, FARTHER, MOST_VIEW_RAD = 100.0, 1.25, radians(40.0)
 """Nearest distance of the camera in scene units, as in the paper, or as far as the object fills no wider view; and the
 farthest in nearest ones. Twice, as in the paper, leaves a quarter of the picture's pixels."""
 
@@ -318,8 +319,8 @@ class _Source(NamedTuple):
     up: int
     up_reason: str
     assembly: bool = True
-    lost: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    lost: Names = ()
+    notes: Names = ()
     robot: tuple[RobotJoint, ...] | None = None
 
 
@@ -453,7 +454,7 @@ def _from_volumes(files: Sequence[Path], relative: Sequence[str]) -> _Source:
     if not volume.values:
         raise ValueError(f"{files[0]} holds only empty space; a label volume has values above 0: export it again")
     names = {value: _segment_name(volume.names.get(value, f"label_{value}")) for value in volume.values}
-    thin = dict[str, str]()
+    thin = Texts()
     try:
         mesh, cells, losses = _surfaces(volume, names)
     except ThinSegmentError as error:
@@ -479,7 +480,7 @@ def _surfaces(
 
     Raises ``ThinSegmentError`` where none does.
     """
-    thin = dict[str, str]()
+    thin = Texts()
     for cells in LABEL_CELLS:
         with warnings.catch_warnings(record=True) as losses:
             warnings.simplefilter("always", LabelWarning)
@@ -527,7 +528,7 @@ def _draft(name: str, source: _Source, meshes: MeshesConfig, aperture: float) ->
     up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
     if base is not None:
         up_reason, (x, y, z) = "it stands on its flat base", [rounded(value, 3) for value in -base.normal]
-    workspace = Workspace(float(np.deg2rad(aperture)), axis=(x, y, z), any_roll=aperture == 360.0)
+    workspace = Workspace(radians(aperture), axis=(x, y, z), any_roll=aperture == 360.0)
     near, far, view = _default_view(rest, moves.draw(rest, placement), workspace)
     unit, reason = (meshes.units, "as you said") if meshes.units else (source.unit, source.reason)
     text = TEMPLATE.format(
@@ -570,7 +571,7 @@ class _Moves(NamedTuple):
     way: Way
     joints: Sequence[Joint]
     blocks: Blocks
-    robot: Sequence[dict[str, Any]] = ()
+    robot: Sequence[JsonObject] = ()
 
     def describe(self) -> str:
         if not self.blocks:
@@ -598,7 +599,7 @@ def _joint_block(joint: Joint) -> JointBlock:
     return JointBlock(type="joint", pivot=(x, y, z), axis=(u, v, w), angle=angle, slide=slide)
 
 
-def _robot_block(joint: RobotJoint) -> dict[str, Any]:
+def _robot_block(joint: RobotJoint) -> JsonObject:
     """Block of a joint of a robot's file."""
     limits = np.rad2deg(joint.limits) if joint.turns else np.array(joint.limits)
     numbers = {"pivot": joint.pivot, "axis": joint.axis, "angle" if joint.turns else "slide": limits}
@@ -686,7 +687,7 @@ def _range(values: Range) -> str:
     return f"[{values[0]:.4g}, {values[1]:.4g}]"
 
 
-def _yaml(blocks: Sequence[Mapping[str, Any]]) -> str:
+def _yaml(blocks: Sequence[Facts]) -> str:
     """Blocks as YAML, their lists on a line each."""
     return yaml.safe_dump(
         list(blocks), sort_keys=False, allow_unicode=True, default_flow_style=None, width=float("inf")
