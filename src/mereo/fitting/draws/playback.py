@@ -29,9 +29,6 @@ STATES_SEED = 400_000
 MOST_DRAWS = 120
 """Scenes with more free numbers are left to the modes."""
 
-SHORTEST = 1e-9
-"""Least length of a direction."""
-
 LARGEST = 4.0
 """Standard deviations; farther out a share is 0 or 1."""
 
@@ -101,7 +98,9 @@ class Drawn:
         """
         z = z.copy()
         for each in self.directions:
-            z[each] *= np.sqrt((len(each) - 1) / 2) / max(float(np.linalg.norm(z[each])), SHORTEST)
+            z[each] *= np.sqrt((len(each) - 1) / 2) / max(
+                float(np.linalg.norm(z[each])), 1e-9
+            )  # nothing is no direction
         return z
 
     def deformations(
@@ -222,10 +221,6 @@ class DrawnStates:
         return replace(like, z=np.where(like.smooth, np.clip(answer, -2.0, 2.0), like.z))
 
 
-SAME = 1e-3
-"""Scene units up to which places are the same, which are in single precision."""
-
-
 def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call]]) -> Directions:
     """Find the normal draws that are directions: rows of a call's numbers, or together all after the last such row.
 
@@ -233,15 +228,15 @@ def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call
     """
     directions = dict[Place, list[Numbers]]()
     for calls in states:
-        drawn, end = Drawn.recorded(calls, 0), 0
-        for call in calls:
-            end += len(call.shares)
-            if call.kind == "normal" and call.shape and call.key[0] not in directions:
-                numbers = np.arange(end - len(call.shares), end)
-                each = [row for row in numbers.reshape(-1, call.shape[-1]) if is_direction(scene, played, drawn, row)]
-                rest = numbers[len(each) * call.shape[-1] :]
-                each += [rest] if len(rest) and is_direction(scene, played, drawn, rest) else []
-                directions[call.key[0]] = [part - numbers[0] for part in each]
+        drawn = Drawn.recorded(calls, 0)
+        ends = np.cumsum(drawn.sizes)
+        normal = [(call, end) for call, end in zip(calls, ends, strict=True) if call.kind == "normal" and call.shape]
+        for call, end in [(call, end) for call, end in normal if call.key[0] not in directions]:
+            numbers, row = np.arange(end - len(call.shares), end), call.shape[-1]
+            parts = [part for part in numbers.reshape(-1, row) if is_direction(scene, played, drawn, part)]
+            rest = numbers[len(parts) * row :]
+            parts += [part for part in (rest,) if is_direction(scene, played, drawn, part)]
+            directions[call.key[0]] = [part - numbers[0] for part in parts]
     return directions
 
 
@@ -251,13 +246,12 @@ def is_direction(scene: Scene, played: Played, drawn: Drawn, numbers: Numbers) -
     def moves(other: Float[np.ndarray, " n"]) -> bool:
         z = drawn.z.copy()
         z[numbers] = other
-        before, after = (drawn.deformations(scene, each, checked=False) for each in (drawn.z, z))
-        if before is None or after is None:
-            return True
-        return not np.allclose(played.moved(before), played.moved(after), rtol=0.0, atol=SAME)
+        states = (drawn.deformations(scene, each, checked=False) for each in (drawn.z, z))
+        places = [played.moved(state) for state in states if state is not None]
+        return len(places) < 2 or bool(np.ptp(places, axis=0).max() > 1e-3)  # scene units, in single precision
 
-    own = drawn.z[numbers]
-    return len(own) > 1 and moves(own[::-1]) and not moves(own / 2)
+    share = drawn.z[numbers]
+    return len(share) > 1 and moves(share[::-1]) and not moves(share / 2)
 
 
 def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:

@@ -99,13 +99,13 @@ class Signs:
     ) -> "Signs":
         """Signs of a registration; ``stated_scene_unit`` is the length of a scene unit as the frame's unit says it."""
         # at rest it is known, whatever was learned, and what its scene plays is one of its states
-        is_own, z = registration.method in ("rest", "draws"), registration.modes_z
+        is_learned, z = registration.method in ("rest", "draws"), registration.modes_z
         return cls(
             size=None if stated_scene_unit is None else abs(float(np.log(registration.scene_unit / stated_scene_unit))),
             unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, 0.01),
             ruled_out=registration.ruled_out,
-            beyond=None if is_own else registration.beyond_states,
-            unusual=None if is_own or not len(z) else registration.model.unusual(z),
+            beyond=None if is_learned else registration.beyond_states,
+            unusual=None if is_learned or not len(z) else registration.model.unusual(z),
             displaced=displaced,
             unseen=unseen,
         )
