@@ -306,10 +306,7 @@ def message(text: str, bad: bool = False) -> str:
 
 def color_bar(scale: ColorScale) -> str:
     """Bar with all colours of a scale, and what stands below it."""
-    stops, words = (
-        ",".join(css(color) for color in scale.stops),
-        "".join(f"<span>{escape(w)}</span>" for w in scale.words),
-    )
+    stops, words = ",".join(map(css, scale.stops)), "".join(f"<span>{escape(w)}</span>" for w in scale.words)
     return (
         f'<div style="{BOX}"><div>{escape(scale.title)}</div><div style="height:9px;border-radius:5px;margin:3px 0;'
         f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'

@@ -46,8 +46,8 @@ from mereo.io.writers.formats import WRITERS, chosen_formats
 from mereo.io.writers.volumes import MM_PER_M
 from mereo.reconstruction.pipeline import Reconstruction, described
 from mereo.results.carry import carry, place
-from mereo.results.joints import JointValue, JointValues, measure_joints, pose_covariance
-from mereo.visualization.reconstruction_report import result_html
+from mereo.results.joints import JointValues, measure_joints, pose_covariance
+from mereo.visualization.reconstruction_report import result_html, stated_joints
 from mereo.visualization.result_files import (
     INSTANCE,
     summary_of,
@@ -633,12 +633,7 @@ class StoredResult(SegmentedResult):
     @property
     def joints(self) -> JointValues:
         """As ``Result.joints``."""
-        return {
-            name: JointValue(
-                each["value"], each["interval"] and tuple(each["interval"]), each["unit"], tuple(each["limits"])
-            )
-            for name, each in self.facts.get("joints", {}).items()
-        }
+        return stated_joints(self.facts)
 
     @cached_property
     def _segments(self) -> SegmentResults:
