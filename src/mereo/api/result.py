@@ -36,7 +36,7 @@ from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, to_jso
 from mereo.io.attachments import Attachment, Content, PoseTable, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.bounds import Port, check_value
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.errors import AnyPath, checked_path, readable
+from mereo.io.errors import AnyPath, checked_path, readable, value_text
 from mereo.io.mesh_formats import read_glb
 from mereo.io.point_arrays import mesh_of, model_points, parts_of_scene
 from mereo.io.readers import read_arrays
@@ -233,6 +233,7 @@ class Result(Answer, SegmentedResult):
         T_result_original = inverse_rigid(self.T_camera_input) @ self.original.T_camera_input
         return self.original.reconstruction.transformed(T_result_original)
 
+    @python_words()
     def transformed(self, T_new_frame: ArrayLike) -> "Result":
         """Result in another frame, such as a robot's base: poses, surfaces, labels, covariance and what is carried.
 
@@ -453,7 +454,9 @@ class Result(Answer, SegmentedResult):
 
 def _check_list(formats: object) -> None:
     if isinstance(formats, str) or not isinstance(formats, Iterable | None):
-        raise ValueError(f"formats is {formats!r}; it must be a list of names: give for example ('glb', 'json')")
+        raise ValueError(
+            f"formats is {value_text(formats)}; it must be a list of names: give for example ('glb', 'json')"
+        )
 
 
 def free_folder() -> Path:
