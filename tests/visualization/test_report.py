@@ -191,6 +191,9 @@ def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
     assert Unit(None).place(place, 0.0) == "-0.0247 -1e-06 1.59 ± 0", "without an error as without a radius"
     assert Unit(0.01).volume(648.0, (633.2, 663.1)) == "648 (633 to 663)"
     assert Unit(None).volume(4.9012, (4.889, 4.9204)) == "4.901 (4.889 to 4.920)"
+    assert Unit(None).volume(190.0721, (190.0719, 190.0723)) == "190.1", "of a rigid object"
+    assert Unit(None).volume(1575.0, (1574.99, 1575.01)) == "1,575"
+    assert Unit(None).volume(0.0190072, (0.0189981, 0.0190163)) == "0.01901 (0.01900 to 0.01902)"
 
 
 TAKEN = {"answer": "registration", "explained": 0.989, "accepted": True}
