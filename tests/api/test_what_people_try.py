@@ -138,7 +138,8 @@ NORMALS = np.array([0.0, 0.6, -0.8]) * np.ones((1200, 1))
 def test_columns_behind_positions_are_normals_or_colours() -> None:
     points = seen()
     oriented = np.hstack([points, NORMALS])
-    cloud = load_frame(oriented.reshape(30, 40, 6)).cloud
+    with pytest.warns(InputWarning, match="^the last three columns of the ndarray .* are normals, which are used$"):
+        cloud = load_frame(oriented.reshape(30, 40, 6)).cloud
     assert_allclose(np.hstack([cloud.points, cloud.normals]), oriented)
     for colors in (np.abs(NORMALS), 255 * (NORMALS > 0)):
         with pytest.warns(InputWarning, match="^the last three columns of the ndarray .* are colours, which are lef"):
