@@ -43,7 +43,7 @@ from mereo_viewer.display import (
     score_table,
 )
 from mereo_viewer.result_page import source_of
-from mereo_viewer.server import OpenPage, import_viser, start_server
+from mereo_viewer.server import OpenPage, start_server
 
 CELLS = 64
 """Cells a side on which an answer is scored; the paper takes 100, fewer are faster and a little off."""
@@ -232,7 +232,6 @@ def open_laboratory(scene: Scene, network: Trained | None, registrar: Registrar 
 
     Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
     """
-    import_viser()
     laboratory = Laboratory(scene, network, registrar)
     server = start_server(port)
     LabPage(server, laboratory).update()

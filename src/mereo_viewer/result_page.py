@@ -23,7 +23,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.solids import Solids, signed_distance_and_direction
-from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
+from mereo.geometry.transforms import box_of, inverse_rigid, rigid, rotation_along, transform_points
 from mereo.io.errors import words_of
 from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
@@ -251,8 +251,7 @@ class Content:
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Box of surfaces and points."""
         clouds = [] if self.cloud is None else [self.cloud.points]
-        joint = np.concatenate([*clouds, *(segment.vertices for segment in self.mesh.segments)])
-        return np.stack([joint.min(axis=0), joint.max(axis=0)])
+        return box_of(np.concatenate([*clouds, *(segment.vertices for segment in self.mesh.segments)]))
 
 
 def open_answer(answer: Answer, port: int, picks: Picks | None = None) -> OpenPage:
