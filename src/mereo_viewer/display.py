@@ -74,9 +74,15 @@ class Display:
         return points / self.scale + self.center
 
     def add_panel(self, title: str) -> Any:
-        """Add a panel at the right and return its tab, a context; pages as narrow as a phone show it folded."""
+        """Add a panel at the right and return its tab, a context; pages below 600 pixels show it folded.
+
+        Of several pages the one that was opened last decides: viser folds a panel for all. A phone folds it by itself.
+        """
         panel = self.server.gui.add_panel()
         panel.dock_right()
+        self.server.on_client_connect(
+            lambda client: (panel.minimize if client.camera.image_width < 600 else panel.expand)()
+        )
         return panel.add_tab(title)
 
     def add_axes(self, corner: Float[np.ndarray, "3"], length: float, text: str) -> None:
@@ -290,9 +296,8 @@ def heading(title: str, text: str) -> str:
 
 def hint(text: str) -> str:
     """How to turn a page, by mouse or by hand, and a line below."""
-    hidden = "{display:none}"
     return (
-        f"<style>@media(pointer:coarse){{.mouse{hidden}}}@media not (pointer:coarse){{.fingers{hidden}}}</style>"
+        "<style>@media(pointer:coarse){.mouse{display:none}}@media not (pointer:coarse){.fingers{display:none}}</style>"
         f'<div style="{BOX};{SOFT}">drag to turn · <span class="mouse">scroll to zoom · right-drag to move</span>'
         f'<span class="fingers">pinch to zoom · two fingers to move</span><br>{escape(text)}</div>'
     )
@@ -300,16 +305,12 @@ def hint(text: str) -> str:
 
 def message(text: str, bad: bool = False) -> str:
     """Line on what is going on; "" is an empty line, so that nothing jumps."""
-    color = "color:#e5484d" if bad else SOFT
-    return f'<div style="{BOX};min-height:1.9em;{color}">{escape(text) or "&nbsp;"}</div>'
+    return f'<div style="{BOX};min-height:1.9em;{"color:#e5484d" if bad else SOFT}">{escape(text) or "&nbsp;"}</div>'
 
 
 def color_bar(scale: ColorScale) -> str:
     """Bar with all colours of a scale, and what stands below it."""
-    stops, words = (
-        ",".join(css(color) for color in scale.stops),
-        "".join(f"<span>{escape(w)}</span>" for w in scale.words),
-    )
+    stops, words = ",".join(map(css, scale.stops)), "".join(f"<span>{escape(w)}</span>" for w in scale.words)
     return (
         f'<div style="{BOX}"><div>{escape(scale.title)}</div><div style="height:9px;border-radius:5px;margin:3px 0;'
         f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'

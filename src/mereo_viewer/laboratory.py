@@ -43,7 +43,7 @@ from mereo_viewer.display import (
     score_table,
 )
 from mereo_viewer.result_page import source_of
-from mereo_viewer.server import OpenPage, import_viser, start_server
+from mereo_viewer.server import OpenPage, start_server
 
 CELLS = 64
 """Cells a side on which an answer is scored; the paper takes 100, fewer are faster and a little off."""
@@ -232,7 +232,6 @@ def open_laboratory(scene: Scene, network: Trained | None, registrar: Registrar 
 
     Raises ``ImportError`` without the extra `view`, and ``OSError`` for a port that is taken.
     """
-    import_viser()
     laboratory = Laboratory(scene, network, registrar)
     server = start_server(port)
     LabPage(server, laboratory).update()
@@ -395,9 +394,8 @@ class LabPage:
             T_world_camera, aside = view.T_world_camera, self._aside(view)
             self.truth.show(view.mesh.transformed(T_world_camera), self.controls, shift=aside)
             self.points.show(PointCloud(transform_points(T_world_camera, view.depth.to_points().points)), -aside)
-            for name in self._names:
-                name.remove()
-            self._names = []
+            while self._names:
+                self._names.pop().remove()
             if trial is None:
                 self.answer.clear_from()
                 return
@@ -406,7 +404,7 @@ class LabPage:
             foot = np.array([(low[0] + high[0]) / 2, high[1] + GAP / self.stage.scale, (low[2] + high[2]) / 2])
             place = self.stage.place(transform_points(T_world_camera, foot))
             for text, shift in (("reconstruction", -aside), ("truth", aside)):
-                label = self.server.scene.add_label(
-                    f"/names/{text}", text, position=tuple(place + shift), anchor="top-center"
+                at = tuple(place + shift)
+                self._names.append(
+                    self.server.scene.add_label(f"/names/{text}", text, position=at, anchor="top-center")
                 )
-                self._names.append(label)

@@ -23,12 +23,13 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import Color, SegmentedMesh
 from mereo.geometry.radii import Radii
 from mereo.geometry.solids import Solids, signed_distance_and_direction
-from mereo.geometry.transforms import inverse_rigid, rigid, rotation_along, transform_points
+from mereo.geometry.transforms import box_of, inverse_rigid, rigid, rotation_along, transform_points
 from mereo.io.errors import words_of
 from mereo.io.mesh_formats import GlbScene, is_glb, read_glb
 from mereo.io.writers.formats import WRITERS
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.models.trained import Answer as NetworkAnswer
+from mereo.results.joints import measure_joints
 from mereo.results.state import STATE
 from mereo.visualization.color_scales import (
     CONFIDENCE,
@@ -39,7 +40,7 @@ from mereo.visualization.color_scales import (
     radius_scale,
 )
 from mereo.visualization.contact_sheets import Picture, depth_ends, depth_picture
-from mereo.visualization.reconstruction_report import REPORT, read_report
+from mereo.visualization.reconstruction_report import REPORT, joint_table, read_report
 from mereo.visualization.result_files import radii_of, to_viewer_of
 from mereo.visualization.units import UNKNOWN, Unit
 from mereo_viewer.display import (
@@ -229,6 +230,7 @@ class Content:
         ask: what is known of places; None where there is nothing to probe.
         is_doubtful: whether the verdict is that the surfaces are not to be trusted.
         picks: what a click can say where the object is in; None where nothing is looked for.
+        joints: HTML of their table; empty without any.
     """
 
     title: str
@@ -243,13 +245,13 @@ class Content:
     ask: Callable[[Float[np.ndarray, "n 3"]], Probed] | None = None
     is_doubtful: bool = False
     picks: Picks | None = None
+    joints: str = ""
 
     @property
     def bounds(self) -> Float[np.ndarray, "2 3"]:
         """Box of surfaces and points."""
         clouds = [] if self.cloud is None else [self.cloud.points]
-        joint = np.concatenate([*clouds, *(segment.vertices for segment in self.mesh.segments)])
-        return np.stack([joint.min(axis=0), joint.max(axis=0)])
+        return box_of(np.concatenate([*clouds, *(segment.vertices for segment in self.mesh.segments)]))
 
 
 def open_answer(answer: Answer, port: int, picks: Picks | None = None) -> OpenPage:
@@ -266,7 +268,6 @@ def open_files(path: Path, port: int) -> OpenPage:
 
     Raises as ``open_answer`` and ``content_of_files`` do.
     """
-    import_viser()
     return _opened(content_of_files(path), port)
 
 
@@ -297,6 +298,7 @@ def content_of_answer(answer: Answer) -> Content:
         depth=depth,
         colorings=colorings,
         ask=partial(probe_answer, answer),
+        joints=joint_table(measure_joints(answer)),
     )
 
 
@@ -331,18 +333,26 @@ def content_of_files(path: Path) -> Content:
     if any(colors is not None for colors in scene.colors):
         colorings[VERTEX] = lambda: (_vertex_colors(scene), None)
     colorings |= _measured_colorings(scene.mesh, unit, cloud, scene.radii)
-    return Content(
-        title=path.name if report is None else report.title,
+    shown = Content(
+        title=path.name,
         facts=_facts(scene, unit, None if report is None else report.count),
-        verdict="" if report is None else report.verdict,
+        verdict="",
         mesh=scene.mesh,
         unit=unit,
         rotation=scene.rotation,
         cloud=cloud,
-        depth=None if report is None or report.depth is None else (report.depth, report.ends),
         colorings=colorings,
         ask=partial(probe_surfaces, Solids(scene.mesh), scene.radii) if scene.is_ours else None,
-        is_doubtful=report is not None and report.level == "no",
+    )
+    if report is None:
+        return shown
+    return replace(
+        shown,
+        title=report.title,
+        verdict=report.verdict,
+        depth=None if report.depth is None else (report.depth, report.ends),
+        is_doubtful=report.level == "no",
+        joints=joint_table(report.joints),
     )
 
 
@@ -422,11 +432,18 @@ class ResultPage:
 
     def _build(self) -> None:
         gui, content = self.server.gui, self.content
-        self.heading = gui.add_html(heading(content.title, content.facts))
-        if content.verdict:
-            self.verdict = gui.add_html(message(content.verdict, bad=content.is_doubtful))
+        self.heading, self.verdict, self.hint = (gui.add_html("") for _ in range(3))
+        self._say()
         with self.stage.add_panel("Show"):
             self._fill(gui, content)
+
+    def _say(self) -> None:
+        """What a phone shows below the object, and a wide page beside it."""
+        content = self.content
+        self.heading.content = heading(content.title, content.facts)
+        verdict = content.verdict and message(content.verdict, bad=content.is_doubtful)
+        self.verdict.content = verdict + (content.joints and f'<div style="{BOX}">{content.joints}</div>')
+        self.hint.content = self._add_axes()
 
     def _fill(self, gui: Any, content: Content) -> None:
         colorings = (SEGMENT, *content.colorings)
@@ -445,7 +462,6 @@ class ResultPage:
             self.picking.on_update(lambda _: self._show_points())
         toward = content.rotation.T @ [0.0, 0.0, 1.0]
         self._look = self.stage.add_views(lambda: toward, lambda: self.content.bounds)
-        self.hint = gui.add_html(self._add_axes())
         if content.ask is not None:
             self._build_probe()
         if content.depth is not None:
@@ -510,9 +526,7 @@ class ResultPage:
             self.picking.value = False
             self._look("front")
             self._draw()
-            self.hint.content = self._add_axes()
-            self.heading.content = heading(self.content.title, self.content.facts)
-            self.verdict.content = message(self.content.verdict, bad=self.content.is_doubtful)
+            self._say()
         except Exception as error:  # whatever it is, the page must live on and say it
             self.verdict.content = message(words_of(error), bad=True)
         finally:

@@ -138,7 +138,8 @@ NORMALS = np.array([0.0, 0.6, -0.8]) * np.ones((1200, 1))
 def test_columns_behind_positions_are_normals_or_colours() -> None:
     points = seen()
     oriented = np.hstack([points, NORMALS])
-    cloud = load_frame(oriented.reshape(30, 40, 6)).cloud
+    with pytest.warns(InputWarning, match="^the last three columns of the ndarray .* are normals, which are used$"):
+        cloud = load_frame(oriented.reshape(30, 40, 6)).cloud
     assert_allclose(np.hstack([cloud.points, cloud.normals]), oriented)
     for colors in (np.abs(NORMALS), 255 * (NORMALS > 0)):
         with pytest.warns(InputWarning, match="^the last three columns of the ndarray .* are colours, which are lef"):
@@ -444,6 +445,14 @@ REFUSED = {
         lambda: answered(isolation={"largest_clusters": True}), "is largest_cluster meant"
     ),
     "a misspelled field": (lambda: mereo.evaluate(MODEL, exmples=1), "^there is no option 'exmples' here: is examples"),
+    "joints of a tracker": (lambda: mereo.Tracker(MODEL, joint={}), "^there is no option 'joint' here: is joints mea"),
+    "a format of a file": (lambda: Result.save(MagicMock(), "x", format="glb"), "'format' here: is formats meant"),
+    "a browser": (lambda: Result.show(MagicMock(), browser=True), "no option 'browser' here: .* block, port$"),
+    "a transform": (lambda: Result.transformed(MagicMock(), T=T_BASE), "'T' here: the options are T_new_frame$"),
+    "a name with the same letters": (lambda: load_object("rope", quiet=True), "'quiet' here: the options are defor"),
+    "an object of a file": (lambda: mereo.Object("x.stl"), "^the network of an object is 'x.stl'; .* use load_object$"),
+    "an object of an array": (lambda: load_object(np.eye(4)), r"^the object is array\(\[\[1., 0.*\.\.\.; it must be"),
+    "a path of an array": (lambda: Result.save(MagicMock(), np.eye(9)), r"^path is array\(\[\[1., 0.*\.\.\.; it must"),
     "axes as the command has them": (lambda: load_frame(seen(), frame="scanner"), "axes='scanner' states"),
     "an output": (lambda: answered(output="x"), r"'output' here: result.save\(path, "),
     "an unlike name": (lambda: load_frame(seen(), xyzzy=1), "'xyzzy' here: the options are axes, camera_pose, d"),

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from angle import write_angle
 from folder_contents import read_json
+from numpy.testing import assert_allclose
 from page_blocks import FENCE, ROOT, blocks
 
 from mereo.scenes.files.object_files import scene_of_meshes
@@ -230,6 +231,9 @@ def test_every_block_of_a_page_runs_as_printed(page: str, clone: Path, monkeypat
                 run_line(line, clone)
         done += 1
     assert done >= 2 and (clone / "out/demo/bun000-meshes/report.html").is_file()
+    for shown in re.findall(r"hinge: (\S+)° \((\S+) to (\S+)\)", text):
+        hinge = read_json(clone / "opened/summary.json")["joints"]["hinge"]
+        assert_allclose(np.array(shown, float), np.rad2deg([hinge["value"], *hinge["interval"]]), atol=0.05)
 
 
 @pytest.mark.slow

@@ -14,21 +14,25 @@ from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
+from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 import torch
 from folder_contents import run_mereo
 
 import mereo.__main__ as command_line
+from mereo.api.result import Result
 from mereo.cli import tools as doctor
 from mereo.cli import training
 from mereo.cli.answers import ReconstructCommand
 from mereo.cli.options import Outcome
-from mereo.cli.reconstruct import FrameJob
+from mereo.cli.reconstruct import FrameJob, print_segments
 from mereo.geometry.conventions import Names, Texts
 from mereo.io.config import InputConfig
 from mereo.models import device
 from mereo.models.config import InferenceConfig
+from mereo.reconstruction.pipeline import SegmentFacts
 from mereo.scenes.scene import SCENES
 from mereo.synthesis.config import GenerateConfig
 from mereo_learning.config import PRESETS
@@ -51,6 +55,23 @@ def test_help_loads_no_heavy_library_and_few_modules(command: str) -> None:
     heavy, _, modules = result.stdout.splitlines()[-1].rpartition(" ")
     assert heavy == "[]", result.stderr
     assert int(modules) < 450
+
+
+@pytest.mark.parametrize("confidence, cells", [(np.nan, ["1", "1 2 3"]), (0.5, ["0.50", "1", "1 2 3"])])
+def test_a_row_of_what_is_lost_has_its_cells_below_their_heads(
+    confidence: float, cells: Names, capsys: pytest.CaptureFixture
+) -> None:
+    centroid = np.array([1.0, 2.0, 3.0])
+    rows = [
+        SegmentFacts("a", 1, 4.0, centroid, np.zeros((2, 3)), confidence, 9, 1),
+        SegmentFacts("b", 2, 0.0, np.nan * centroid, np.full((2, 3), np.nan), np.nan, 0, 0),
+    ]
+    made = MagicMock(segments=rows, timings_s={}, calibrated=True)
+    result = MagicMock(spec=Result, seen=MagicMock(), unit_m=None, registered=None, reconstruction=made)
+    result.__getitem__.return_value.error_radius = None
+    print_segments(result)
+    table = [[cell.strip() for cell in line.split("│")[1:-1]] for line in capsys.readouterr().out.splitlines()]
+    assert ["a", "4", *cells] in table and ["b", "0", *[""] * (len(cells) - 2), "0", "not found"] in table
 
 
 @pytest.mark.parametrize("option", ["-V", "--version"])

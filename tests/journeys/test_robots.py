@@ -33,6 +33,7 @@ from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
+from mereo_viewer.result_page import content_of_answer, content_of_files
 
 pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
 
@@ -318,6 +319,9 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
     assert_allclose(joint.limits, (0.3, 2.2))
     assert re.fullmatch(r"82\.\d+° \(82\.\d+ to 82\.\d+\)", str(joint))
+    folder, cells = result.save(tmp_path / "result"), f"hinge</td><td style=.*>{re.escape(str(joint))}<"
+    for page in (result._repr_html_(), content_of_answer(result).joints, content_of_files(folder).joints):
+        assert len(re.findall(cells, page)) == 1, "as in the report, from which the last one is"
 
 
 def test_the_commands_of_the_page_give_the_joints_of_a_gripper(

@@ -27,7 +27,7 @@ from numpy import ndarray
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
 
-from mereo.io.atomic_files import JsonObject
+from mereo.io.atomic_files import JsonObject, to_json
 
 pytest.importorskip("fastapi", reason="fastapi (extra `serve`) is not installed")
 pytest.importorskip("python_multipart", reason="python-multipart (extra `serve`) is not installed")
@@ -42,6 +42,7 @@ from analytic import AnalyticModel
 from camera_files import write_camera
 from fuzz import damaged, zipped
 from PIL import Image
+from robot_files import LAPTOP
 from two_balls import NAMES, fronts, two_balls
 
 import mereo
@@ -51,6 +52,9 @@ from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
+from mereo.scenes.random_states import CACHE_VARIABLE
+from mereo.synthesis.config import GenerateConfig
+from mereo.synthesis.examples import sample_view
 from mereo.synthesis.sample_views import load_view
 from mereo_serving.answering import Answerer
 from mereo_serving.app import Service, make_app
@@ -243,6 +247,21 @@ async def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model,
             headers={"Accept": GLB},
         )  # fmt: skip
         assert again.content == alone.save(tmp_path / "segments.glb").read_bytes()
+
+
+async def test_the_joints_of_a_mechanism_are_in_its_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("yourdfpy", reason="yourdfpy (extra `robot`) is not installed")
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
+    path = tmp_path / "laptop.urdf"
+    path.write_text(LAPTOP)
+    laptop = mereo.load_object(path)
+    assert laptop.scene is not None and laptop.scene.unit_m is not None
+    cloud = laptop.scene.unit_m * sample_view(laptop.scene, GenerateConfig(), default_rng(0)).depth.to_points().points
+    joints = mereo.reconstruct(cloud, laptop, unit_m=1.0).joints
+    (tmp_path / "s").mkdir()
+    async with running(tmp_path / "s", given=Setup((Served("balls", object=(str(path),)),), "auto", EXACT)) as server:
+        answer = figures(await server.post(npy(cloud), f"{ADDRESS}?unit-m=1"))
+    assert answer["joints"] == to_json({"hinge": joints["hinge"].facts()}) and answer["verdict"] == "yes"
 
 
 def clouds(count: int) -> Iterator[ndarray]:

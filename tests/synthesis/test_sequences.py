@@ -158,9 +158,11 @@ def test_the_command_records_what_stream_answers(tmp_path: Path, capsys: pytest.
     out = tmp_path / "rope"
     small = ["--seconds", "0.2", "--rate", "10", "--seed", "3"]
     assert run_mereo("scene", "record", "rope", "--output", out, *small) == 0
-    assert "2 frames in 0.2 s" in capsys.readouterr().out and len(list((out / "frames").iterdir())) == 2
-    options = ["--weights", "rope", "--every-frame", "--rate", "10", "--resolution", "16"]
-    assert run_mereo("stream", out, *options) == 0
+    printed = capsys.readouterr().out
+    assert "2 frames in 0.2 s" in printed and len(list((out / "frames").iterdir())) == 2
+    *command, named, name = printed.splitlines()[-1].split()
+    assert (named, name) == ("--object", "rope"), "which has weights, that answer sooner"
+    assert run_mereo(*command[1:], "--weights", "rope", "--every-frame", "--resolution", "16") == 0
     lines = [json.loads(text) for text in capsys.readouterr().out.splitlines()]
     assert [(one["method"], one["tracked"]) for one in lines] == [("modes", False), ("modes", True)]
     assert all(one["explained"] > 0.9 for one in lines)

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -181,6 +182,20 @@ def test_a_page_looks_at_the_middle_of_the_object_from_where_all_of_it_is_seen(s
     half_angle = np.arctan(np.tan(np.deg2rad(20)) * min(aspect, 1))
     radius = norm(np.subtract(camera.position, camera.look_at)) * np.sin(half_angle)
     assert radius == pytest.approx(norm(np.ptp(bounds, axis=0)) / 2 * stage.scale), "of the ball around it"
+
+
+@pytest.mark.slow
+@needs_viser
+@needs_browser
+@pytest.mark.parametrize("width, is_open", [(390, False), (590, False), (640, True)])
+def test_a_narrow_page_has_its_hint_and_a_folded_panel(
+    tmp_path: Path, server: object, width: int, is_open: bool
+) -> None:
+    ResultPage(server, toy_content())
+    with Page(tmp_path, f"http://127.0.0.1:{server.get_port()}", (width, 844)) as browser:  # type: ignore[attr-defined]
+        until(lambda: "drag to turn" in browser.text() and "Show" in browser.text())
+        time.sleep(2)  # by then a panel is open that stays so
+        assert ("Observed points" in browser.text()) is is_open
 
 
 def first_message(port: int, host: str, origin: str | None) -> bytes:

@@ -20,6 +20,7 @@ from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognit
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import JsonObject
+from mereo.results.joints import JointValue
 from mereo.visualization.contact_sheets import MISSING, MOST_DEPTH_PX, depth_data
 from mereo.visualization.reconstruction_report import BUDGET_BYTES, VERDICTS, Report, page_words, trust
 from mereo.visualization.renderer import enclosed
@@ -124,6 +125,11 @@ def test_a_page_has_one_legend_and_a_scale_bar_and_is_folded_on_a_phone(
     tmp_path: Path, width: int, is_phone: bool
 ) -> None:
     cloud, mesh, summary = example()
+    joints = {
+        "a": JointValue(0.5, (0.499, 0.501), "rad", (0.0, 1.0)),
+        "b </script>": JointValue(0.5, None, "m", (0, 1)),
+    }
+    summary |= {"joints": {name: joint.facts() for name, joint in joints.items()}}
     Report(cloud, mesh, summary, unit=Unit(1.0)).write(tmp_path / "r.html")
     with Page(tmp_path, "about:blank", (width, 844)) as page:
         page.call("Emulation.setTouchEmulationEnabled", enabled=is_phone, maxTouchPoints=2)
@@ -135,6 +141,8 @@ def test_a_page_has_one_legend_and_a_scale_bar_and_is_folded_on_a_phone(
         )
         assert is_open is not is_phone and swatches == 0 and ("pinch to zoom" in hint) is is_phone
         told = re.fullmatch(r"scale bar and axes of the camera: x right, y down, z away, each (\d+) cm long", label)
+        cells = page.evaluate("[...document.querySelectorAll('#joints td')].map(cell => cell.innerText)")
+        assert cells == ["a", "28.65° (28.59 to 28.71)", "b </script>", "500 mm"]
         # as many pixels as the length has at the depth of the object's middle
         pixels, per_metre = page.evaluate(
             "[190 - $('scale').querySelector('.bar').x1.baseVal.value, "
@@ -183,6 +191,9 @@ def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
     assert Unit(None).place(place, 0.0) == "-0.0247 -1e-06 1.59 ± 0", "without an error as without a radius"
     assert Unit(0.01).volume(648.0, (633.2, 663.1)) == "648 (633 to 663)"
     assert Unit(None).volume(4.9012, (4.889, 4.9204)) == "4.901 (4.889 to 4.920)"
+    assert Unit(None).volume(190.0721, (190.0719, 190.0723)) == "190.1", "of a rigid object"
+    assert Unit(None).volume(1575.0, (1574.99, 1575.01)) == "1,575"
+    assert Unit(None).volume(0.0190072, (0.0189981, 0.0190163)) == "0.01901 (0.01900 to 0.01902)"
 
 
 TAKEN = {"answer": "registration", "explained": 0.989, "accepted": True}

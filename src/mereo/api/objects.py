@@ -22,7 +22,7 @@ from mereo.geometry.conventions import LengthUnit, Names, Range, Way
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import check_value
 from mereo.io.config import MeshesConfig, RobotMeshes
-from mereo.io.errors import AnyPath, checked_path
+from mereo.io.errors import AnyPath, checked_path, value_text
 from mereo.io.extras import network_needed
 from mereo.io.mesh_formats import MESH_SUFFIXES
 from mereo.io.point_arrays import mesh_of
@@ -64,8 +64,11 @@ class Object:
     _narrowed: "dict[tuple[Range, ...], Object]" = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if self.network is None and self.model is None:
-            raise ValueError("an object has neither weights nor a statistical model; it needs one: use load_object")
+        if not isinstance(self.network, Trained | None) or (self.network is None and self.model is None):
+            raise ValueError(
+                f"the network of an object is {value_text(self.network)}; it must be loaded weights, or None with a "
+                "statistical model: use load_object"
+            )
         if self.network is not None and self.model is None:
             object.__setattr__(self, "model", self.network.statistical_model)
 
@@ -304,7 +307,7 @@ def _scene(source: Source, meshes: MeshesConfig) -> Scene:
     given = [source] if isinstance(source, AnyPath) else source
     if not isinstance(given, Sequence) or not all(isinstance(file, AnyPath) and str(file) for file in given):
         raise ValueError(
-            f"the object is {repr(source)[:80]}; it must be the path of a file or folder, a list of such paths, the "
+            f"the object is {value_text(source)}; it must be the path of a file or folder, a list of such paths, the "
             "name of a scene, a scene, or meshes with vertices and faces: name its meshes"
         )
     files = [Path(str(file)) for file in given]

@@ -25,7 +25,7 @@ from mereo.geometry.transforms import checked_pose
 from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import Instances
 from mereo.io.config import InputConfig
-from mereo.io.errors import AnyPath
+from mereo.io.errors import AnyPath, value_text
 from mereo.io.point_arrays import depth_values, is_frame_list, mask_image, points_of
 from mereo.io.readers import mask_of_image, masked_depth, read_pose
 from mereo.io.ros_recordings import is_recording
@@ -165,8 +165,8 @@ def split_options(isolation: Any, options: JsonObject) -> tuple[IsolationConfig,
     """Settings of isolation, with what of ``options`` is a field of them, and the other options."""
     if not isinstance(isolation, IsolationConfig | Mapping | None):
         raise ValueError(
-            f"isolation is {isolation!r}; it must be an IsolationConfig, or its fields are given by themselves: give "
-            "for example largest_cluster=True"
+            f"isolation is {value_text(isolation)}; it must be an IsolationConfig or a dict of its fields: give for "
+            "example largest_cluster=True by itself"
         )
     check_names(options, RECONSTRUCT_OPTIONS, PLACES)
     stated = isolation if isinstance(isolation, IsolationConfig) else with_changes(IsolationConfig(), isolation or {})
@@ -327,6 +327,7 @@ class Tracker:
     ``close``, or leaving a ``with`` block, ends that thread.
     """
 
+    @python_words()
     def __init__(
         self,
         object: Source,
@@ -349,10 +350,9 @@ class Tracker:
 
         Raises ``ValueError`` for other methods and poses, and for weights without a deformation model.
         """
-        with python_words():
-            self._isolation, _ = split_options(isolation, {})
-            self._initial_pose = None if initial_pose is None else checked_pose(initial_pose)
-            registrar = None if method == "network" else object_of(object, joints).registrar(method)
+        self._isolation, _ = split_options(isolation, {})
+        self._initial_pose = None if initial_pose is None else checked_pose(initial_pose)
+        registrar = None if method == "network" else object_of(object, joints).registrar(method)
         if registrar is None or method == "full":
             raise ValueError(
                 f'the method is {method!r}, and only the modes of a deformation model can be followed: take "auto" '

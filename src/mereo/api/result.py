@@ -36,7 +36,7 @@ from mereo.io.atomic_files import JsonObject, atomic_file, new_directory, to_jso
 from mereo.io.attachments import Attachment, Content, PoseTable, Positions, Surfaces, read_attachments, write_attachment
 from mereo.io.bounds import Port, check_value
 from mereo.io.config import DEFAULT_FILES, CarryFrame, FilesConfig, Format
-from mereo.io.errors import AnyPath, checked_path, readable
+from mereo.io.errors import AnyPath, checked_path, readable, value_text
 from mereo.io.mesh_formats import read_glb
 from mereo.io.point_arrays import mesh_of, model_points, parts_of_scene
 from mereo.io.readers import read_arrays
@@ -46,8 +46,8 @@ from mereo.io.writers.formats import WRITERS, chosen_formats
 from mereo.io.writers.volumes import MM_PER_M
 from mereo.reconstruction.pipeline import Reconstruction, described
 from mereo.results.carry import carry, place
-from mereo.results.joints import JointValue, JointValues, measure_joints, pose_covariance
-from mereo.visualization.reconstruction_report import result_html
+from mereo.results.joints import JointValues, measure_joints, pose_covariance
+from mereo.visualization.reconstruction_report import result_html, stated_joints
 from mereo.visualization.result_files import (
     INSTANCE,
     summary_of,
@@ -233,6 +233,7 @@ class Result(Answer, SegmentedResult):
         T_result_original = inverse_rigid(self.T_camera_input) @ self.original.T_camera_input
         return self.original.reconstruction.transformed(T_result_original)
 
+    @python_words()
     def transformed(self, T_new_frame: ArrayLike) -> "Result":
         """Result in another frame, such as a robot's base: poses, surfaces, labels, covariance and what is carried.
 
@@ -453,7 +454,9 @@ class Result(Answer, SegmentedResult):
 
 def _check_list(formats: object) -> None:
     if isinstance(formats, str) or not isinstance(formats, Iterable | None):
-        raise ValueError(f"formats is {formats!r}; it must be a list of names: give for example ('glb', 'json')")
+        raise ValueError(
+            f"formats is {value_text(formats)}; it must be a list of names: give for example ('glb', 'json')"
+        )
 
 
 def free_folder() -> Path:
@@ -633,12 +636,7 @@ class StoredResult(SegmentedResult):
     @property
     def joints(self) -> JointValues:
         """As ``Result.joints``."""
-        return {
-            name: JointValue(
-                each["value"], each["interval"] and tuple(each["interval"]), each["unit"], tuple(each["limits"])
-            )
-            for name, each in self.facts.get("joints", {}).items()
-        }
+        return stated_joints(self.facts)
 
     @cached_property
     def _segments(self) -> SegmentResults:

@@ -99,6 +99,7 @@ def evaluate(
         return scoring.evaluate(loaded, config, progress=progress, workers=workers)
 
 
+@python_words()
 def export(
     model: Model | str | Path, output: str | Path, format: ExportFormat = "onnx", overwrite: bool = False
 ) -> Path:
@@ -113,9 +114,8 @@ def export(
     Raises ``ValueError`` for an autodecoder, ``ImportError`` without the extra `onnx`, ``FileExistsError`` for a folder
     with content unless ``overwrite``.
     """
-    with python_words():
-        check_value("format", format, ExportFormat, "onnx")
-        export_weights(model, output, format, overwrite)
+    check_value("format", format, ExportFormat, "onnx")
+    export_weights(model, output, format, overwrite)
     return Path(output)
 
 
@@ -158,6 +158,7 @@ class Learned:
         return f"Learned({str(self.folder)!r}: {trained}, method {self.method}, IoU {format_score(self.iou)}{miou})"
 
 
+@python_words()
 def learn(
     object: str | Path | Sequence[str | Path],
     output: str | Path,
@@ -189,8 +190,7 @@ def learn(
     if units is not None:
         check_value("units", units, LengthUnit, "mm")
     processes = workers or os.cpu_count() or 1
-    with python_words():
-        metrics = learning.learn(files, folder, learning.LearnConfig(minutes, init, units, processes, train))
+    metrics = learning.learn(files, folder, learning.LearnConfig(minutes, init, units, processes, train))
     return Learned(
         folder=folder,
         weights=folder / WEIGHTS if metrics["trained"] else None,

@@ -4,7 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from mereo.api.objects import Source, object_of
-from mereo.api.reconstruct import reconstruct_observation
+from mereo.api.reconstruct import Isolation, reconstruct_observation, split_options
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
 from mereo.geometry.transforms import Vector
@@ -28,7 +28,7 @@ def view(
     object: Source = None,
     *,
     reading: InputConfig | None = None,
-    isolation: IsolationConfig | None = None,
+    isolation: Isolation = None,
     resolution: int = 128,
     port: int | None = None,
     block: bool | None = None,
@@ -79,7 +79,7 @@ def view(
         else:
             is_shipped = str(path) in shipped_frames() and not path.exists()
             frame = shipped_frame(str(path)) if is_shipped else read_frame(path, reading or InputConfig())
-            stated, image = isolation or IsolationConfig(), frame.depth
+            (stated, _), image = split_options(isolation, {}), frame.depth
 
             def answer(isolation: IsolationConfig) -> Answer:
                 seen = find_object(frame, isolation)

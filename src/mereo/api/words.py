@@ -1,16 +1,18 @@
 """Messages in the words of Python: sentences name options as the command line does, and a caller has arguments."""
 
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import ContextDecorator, contextmanager
 from contextvars import ContextVar
 from dataclasses import fields, replace
-from difflib import get_close_matches
-from typing import TypeVar, get_args
+from functools import wraps
+from inspect import Parameter, signature
+from typing import Any, TypeVar, get_args
 
 from mereo.fitting.config import AnswerMethod
 from mereo.geometry.conventions import Facts, Names
 from mereo.io.config import CarryFrame
+from mereo.io.errors import nearest
 from mereo.reconstruction.config import Extent
 
 SPEAKS_OPTIONS: ContextVar[bool] = ContextVar("SPEAKS_OPTIONS", default=False)
@@ -65,15 +67,34 @@ def option_words() -> Iterator[None]:
         SPEAKS_OPTIONS.reset(before)
 
 
-@contextmanager
-def python_words() -> Iterator[None]:
-    """Raise errors of the block, or of what this decorates, in the words of Python, unless the command line calls."""
-    try:
-        yield
-    except (ValueError, OSError, ImportError, TypeError) as error:
-        if error.args and isinstance(error.args[0], str):
+Call = TypeVar("Call", bound=Callable[..., Any])
+
+
+class python_words(ContextDecorator):
+    """Raise errors of the block, or of what this decorates, in the words of Python, unless the command line calls.
+
+    What it decorates also refuses arguments that it does not have, as ``check_names`` does.
+    """
+
+    def __enter__(self) -> None: ...
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, ValueError | OSError | ImportError | TypeError) and isinstance((*error.args, 0)[0], str):
             error.args = (in_callers_words(error.args[0]), *error.args[1:])
-        raise
+
+    def __call__(self, function: Call) -> Call:
+        """The function with all of this."""
+        given = signature(function).parameters
+        known = [name for name in given if name != "self"]
+        is_open = any(each.kind == Parameter.VAR_KEYWORD for each in given.values())  # it checks them itself
+
+        @wraps(function)
+        def checked(*arguments: Any, **options: Any) -> Any:
+            with self:
+                check_names(() if is_open else options, known)
+                return function(*arguments, **options)
+
+        return checked  # type: ignore[return-value]
 
 
 # --- options by their names -------------------------------------------------------------------------------------------
@@ -93,8 +114,8 @@ def check_names(given: Iterable[str], known: Collection[str], places: Mapping[st
             continue
         cure = (places or {}).get(name)
         if cure is None:
-            near = get_close_matches(name.lower(), known, 1)
-            cure = f"is {near[0]} meant?" if near else f"the options are {', '.join(sorted(known))}"
+            near = nearest(name.lower(), known)
+            cure = f"is {near} meant?" if near else f"the options are {', '.join(sorted(known))}"
         raise TypeError(f"there is no option {name!r} here: {cure}")
 
 

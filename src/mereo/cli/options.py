@@ -14,7 +14,6 @@ ASSET    a name from `mereo assets list`
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -25,7 +24,7 @@ from mereo.geometry.conventions import Facts, Names
 from mereo.io.atomic_files import JsonObject
 from mereo.io.bounds import GROUP, check_values
 from mereo.io.config import InputConfig, MeshesConfig
-from mereo.io.errors import AnyPath
+from mereo.io.errors import AnyPath, nearest
 from mereo.io.object_storage import Place, place_of
 from mereo.models.config import InferenceConfig
 from mereo.reconstruction.config import IsolationConfig
@@ -213,8 +212,8 @@ def with_options(command: Any, options: JsonObject, path: Path) -> Any:
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from None
     for name in options.keys() - known:
-        near = get_close_matches(name, known, 1)
-        cure = f"correct it, perhaps to {near[0]!r}" if near else "take it out"
+        near = nearest(name, known)
+        cure = f"correct it, perhaps to {near!r}" if near else "take it out"
         raise ValueError(f"{path} has {name!r}, which is no option of this command: {cure} (--help names all)")
     return changed
 

@@ -468,7 +468,7 @@ def print_segments(result: Result) -> None:
         centroid = unit.place(segment.centroid, result[segment.name].error_radius).partition(" ±")[0]
         confidence = [f"{segment.confidence:.2f}"] if has_confidence else []
         row = (volume, *confidence, str(segment.components), centroid)
-        table.add_row(segment.name, *(row if segment.voxels else ("0", "not found", "0", "")))
+        table.add_row(segment.name, *(row if segment.voxels else ("0", *["" for _ in confidence], "0", "not found")))
     Console(markup=False, emoji=False).print(table)
     stages = ", ".join(f"{stage} {seconds:.2f}" for stage, seconds in reconstruction.timings_s.items())
     print(f"seconds: {stages}")

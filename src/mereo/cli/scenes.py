@@ -230,7 +230,8 @@ class SceneRecord:
             scene, sensor = load_scene(self.scene), (self.sensor, SENSORS[self.sensor])
             write_recording(folder, scene, self.settings, sensor, seed, named=self.scene)
         print(f"wrote {self.output}: {self.settings.frames} frames in {self.settings.seconds:g} s; then:")
-        print(f"  mereo stream {self.output} --rate {self.settings.rate:g} --weights WEIGHTS")
+        command = f"mereo stream {shlex.quote(str(self.output))} --rate {self.settings.rate:g}"
+        print(f"  {command} --object {shlex.quote(self.scene)}")
 
 
 @dataclass(frozen=True)

@@ -39,3 +39,12 @@ def as_exact_as(error: float, *values: float) -> list[str]:
     decimals = max(0, 1 - floor(log10(error)))
     # adding 0.0 makes a zero of a negative zero
     return [f"{round(value, decimals) + 0.0:,.{decimals}f}" for value in values]
+
+
+def between(value: float, low: float, high: float) -> str:
+    """Number with its bounds in as many digits as their width allows, but no decimals from the fifth digit on.
+
+    Without bounds where those digits do not tell them apart.
+    """
+    middle, least, most = as_exact_as(max(high - low, abs(value) / 100), value, low, high)
+    return middle if least == most else f"{middle} ({least} to {most})"

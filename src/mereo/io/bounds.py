@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from tyro.conf import arg
 
 from mereo.geometry.conventions import MIN_POINTS, Facts, WholeNumbers
+from mereo.io.errors import value_text
 
 
 @dataclass(frozen=True)
@@ -139,5 +140,4 @@ def _broken_rule(kind: Any, value: Any) -> str | None:
 
 
 def _text(value: object) -> str:
-    text = " ".join(map(repr, value)) if isinstance(value, tuple) else repr(value)
-    return text if len(text) <= 60 else f"{text[:60]}..."
+    return " ".join(map(value_text, value)) if isinstance(value, tuple) else value_text(value)

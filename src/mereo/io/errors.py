@@ -14,6 +14,7 @@ import sysconfig
 import warnings
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, nullcontext, redirect_stderr, redirect_stdout
+from difflib import get_close_matches
 from dis import opmap
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -36,6 +37,12 @@ LIBRARIES = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", 
 
 MOST_CHARACTERS = 300
 """Length of what is quoted of a library's text, which may quote all that it has read."""
+
+MOST_OF_VALUE = 60
+"""Length of what is quoted of a value."""
+
+CLOSE = 0.7
+"""Least likeness, as ``difflib`` has it, of a word to the one that is meant: `unit` is like `units`, `quiet` is not."""
 
 AnyPath = str | Path
 """Path of a file or folder, as people write it or as Python has it."""
@@ -100,6 +107,17 @@ def printable_line(text: str) -> str:
     """Text in one line, with what a terminal would obey (files may have it in names) as Python spells it."""
     line = " ".join(text.split())
     return line if line.isprintable() else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+
+
+def value_text(value: object) -> str:
+    """Value as Python writes it, in one line and not too long: what a sentence says of an argument."""
+    text = printable_line(repr(value))
+    return text if len(text) <= MOST_OF_VALUE else f"{text[:MOST_OF_VALUE]}..."
+
+
+def nearest(word: str, known: Iterable[str]) -> str | None:
+    """Known word that is plainly meant by one that is not known; None where none is so much like it."""
+    return next(iter(get_close_matches(word, list(known), 1, CLOSE)), None)
 
 
 def reason(error: Exception) -> str:
@@ -181,7 +199,7 @@ def limited_memory(path: AnyPath) -> Iterator[None]:
 def checked_path(value: object, name: str) -> Path:
     """Path that an argument of this name is; ``ValueError`` for what is neither a text nor a path."""
     if not isinstance(value, AnyPath):
-        raise ValueError(f"{name} is {value!r}; it must be a path: give a text or a pathlib.Path")
+        raise ValueError(f"{name} is {value_text(value)}; it must be a path: give a text or a pathlib.Path")
     return Path(value)
 
 

@@ -24,7 +24,7 @@ import yaml
 
 from mereo.geometry.camera import Camera, Size
 from mereo.geometry.transforms import Values
-from mereo.io.errors import AnyPath, readable
+from mereo.io.errors import AnyPath, readable, value_text
 
 NAMED = (
     ("fx", "fy", "cx", "cy"),
@@ -102,10 +102,9 @@ def stated_fields(source: Any) -> Fields:
         numbers = np.asarray(source, float)
         return {"K": numbers.tolist()} if numbers.shape == (3, 3) else _fields_of_numbers(numbers.ravel().tolist())
     except (TypeError, ValueError):
-        text = " ".join(repr(source).split())
         raise ValueError(
-            f"intrinsics is {text[:80]}; it must be a camera: give 3 x 3 numbers, (fx, fy, cx, cy), a dict of these, a "
-            "CameraInfo, a mereo.Camera, or the path of a file"
+            f"intrinsics is {value_text(source)}; it must be a camera: give 3 x 3 numbers, (fx, fy, cx, cy), a dict of "
+            "these, a CameraInfo, a mereo.Camera, or the path of a file"
         ) from None
 
 

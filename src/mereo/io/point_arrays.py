@@ -42,7 +42,7 @@ def points_of(source: object, drop_invalid: bool = False) -> tuple[PointCloud | 
 
     - arrays n x 3 or h x w x 3 of integers or floats: numpy's, torch's of any device, and whatever else converts
       itself into a numpy array; masked values are points without a measurement. Of six columns the last three are unit
-      normals, which are used, or colours from 0 to 1 or 255, which are left out with an ``InputWarning``;
+      normals, which are used, or colours from 0 to 1 or 255, which are left out; an ``InputWarning`` says which;
     - lists or tuples of rows of three numbers;
     - structured arrays with fields x, y and z in any order among others, in one or two dimensions;
     - objects with ``points`` or ``vertices`` (Open3D and its tensors, trimesh, PyVista), with their ``normals`` or
@@ -158,16 +158,16 @@ def _positions(source: Any) -> tuple[Points, Points | None, str, bool]:
 def _normals(columns: Points, name: str) -> Points | None:
     """Normals that three more columns of points are; None of colours. Rows that are not finite or 0 say nothing."""
     known = columns[np.isfinite(columns).all(axis=1) & columns.any(axis=1)]
-    if (known < 0).any():
-        if (np.abs(norm(known, axis=1) - 1) < 0.01).all():
-            return columns
-    elif known.max(initial=0) <= 1 or (known.max() <= 255 and (known == np.rint(known)).all()):
-        warnings.warn(f"the last three columns of {name} are colours, which are left out", InputWarning, stacklevel=7)
-        return None
-    raise ValueError(
-        f"{name} has six columns, of which the last three are neither unit normals nor colours from 0 to 1 or 255: "
-        "give the positions alone, as points[:, :3]"
-    )
+    least, most = known.min(initial=0), known.max(initial=0)
+    are_normals = least < 0 and (np.abs(norm(known, axis=1) - 1) < 0.01).all()
+    if (least < 0 and not are_normals) or most > 255 or (most > 1 and (known != np.rint(known)).any()):
+        raise ValueError(
+            f"{name} has six columns, of which the last three are neither unit normals nor colours from 0 to 1 or 255: "
+            "give the positions alone, as points[:, :3]"
+        )
+    meant = "normals, which are used" if are_normals else "colours, which are left out"
+    warnings.warn(f"the last three columns of {name} are {meant}", InputWarning, stacklevel=7)
+    return columns if are_normals else None
 
 
 def _decoded(decode: Callable[[Any], ndarray], message: Any, kind: str) -> ndarray:

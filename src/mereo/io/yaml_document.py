@@ -3,7 +3,6 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from difflib import get_close_matches
 from itertools import chain
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,7 +11,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 from pydantic_core import ErrorDetails
 
-from mereo.io.errors import reason
+from mereo.io.errors import nearest, reason
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -187,5 +186,5 @@ def _fields_at(place: Place, model: type[BaseModel]) -> list[str]:
 
 def similar(word: str, known: list[str]) -> str:
     """Cure for an unknown word: "did you mean ...?" where one is like it, else what is known."""
-    close = get_close_matches(word, known, n=1)
-    return f"did you mean {close[0]!r}?" if close else f"known are {', '.join(known)}"
+    close = nearest(word, known)
+    return f"did you mean {close!r}?" if close else f"known are {', '.join(known)}"

@@ -6,6 +6,7 @@ from numbers import Real
 from typing import Any, Literal
 
 from mereo.io.bounds import NotNegative, check_bounds
+from mereo.io.errors import value_text
 
 Extent = Literal["auto", "whole", "partial", "surface"]
 """Extent of the object that a frame shows: see ``IsolationConfig.extent``."""
@@ -50,7 +51,7 @@ class IsolationConfig:
         check_bounds(self)
         for what, values, count in (("depth range", self.depth_range, 2), ("box", self.box, 6)):
             if values is not None and not is_numbers(values, count):
-                raise ValueError(f"the {what} is {values!r}; it must be {count} numbers: give them in metres")
+                raise ValueError(f"the {what} is {value_text(values)}; it must be {count} numbers: give them in metres")
         if self.depth_range is not None and not 0 <= self.depth_range[0] < self.depth_range[1] < math.inf:
             raise ValueError(
                 f"the depth range is {_numbers(self.depth_range)}; it must be the nearest and the farthest depth in "
@@ -66,8 +67,8 @@ class IsolationConfig:
             )
         if self.point is not None and not (is_numbers(self.point, 2) and all(0 <= k < math.inf for k in self.point)):
             raise ValueError(
-                f"the point is {self.point!r}; it must be the column and the row of a pixel, from 0 at the upper left: "
-                "give for example --point 320 240"
+                f"the point is {value_text(self.point)}; it must be the column and the row of a pixel, from 0 at the "
+                "upper left: give for example --point 320 240"
             )
         if self.cluster_gap > 0 and not self.largest_cluster:
             raise ValueError(

@@ -26,7 +26,7 @@ from mereo.deformation.maps import Deformations
 from mereo.deformation.samplers import JointSampler, RandomMotion
 from mereo.geometry.conventions import Names, Pair, Range
 from mereo.io.bounds import NotNegative, Number, check_value
-from mereo.io.errors import AnyPath
+from mereo.io.errors import AnyPath, value_text
 from mereo.io.yaml_document import Document
 from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Place, Recorder, Shares, Trail
 from mereo.scenes.scene import Scene
@@ -385,13 +385,13 @@ def _values(given: Any, names: list[str]) -> dict[str, Range]:
         are_lists = isinstance(listed, list | tuple) and isinstance(positions, Sized)
         if not are_lists or len(listed) != len(positions):
             raise ValueError(
-                f"`name` is {repr(listed)[:80]} and `position` {repr(positions)[:80]}; they must be lists of one "
+                f"`name` is {value_text(listed)} and `position` {value_text(positions)}; they must be lists of one "
                 "length: correct them"
             )
         given = {name: value for name, value in zip(listed, positions, strict=True) if name in names}
     if not isinstance(given, Mapping) or not given:
         raise ValueError(
-            f"the joints are {repr(given)[:80]}; they must be values by name, of {', '.join(names)}: give for example "
+            f"the joints are {value_text(given)}; they must be values by name, of {', '.join(names)}: give for example "
             f"{{{names[0]!r}: 0.1}}"
         )
     values = dict[str, Range]()
@@ -401,8 +401,8 @@ def _values(given: Any, names: list[str]) -> dict[str, Range]:
         parts = {"within": 0.0, **(value if isinstance(value, Mapping) else {"value": value})}
         if parts.keys() != {"value", "within"}:
             raise ValueError(
-                f"joint {name!r} is {value!r}; it must be a number, or `value` and `within`, its largest error: "
-                "correct it"
+                f"joint {name!r} is {value_text(value)}; it must be a number, or `value` and `within`, its largest "
+                "error: correct it"
             )
         check_value(f"joint {name!r}", parts["value"], Number, 0.1)
         check_value(f"`within` of joint {name!r}", parts["within"], NotNegative, 0.01)

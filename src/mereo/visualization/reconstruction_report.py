@@ -39,6 +39,7 @@ from mereo.geometry.transforms import Indices, Labels, Matrix, Points, Subset, V
 from mereo.io.atomic_files import JsonObject, atomic_file
 from mereo.io.errors import AnyPath
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
+from mereo.results.joints import JointValue, JointValues
 from mereo.visualization.color_scales import radius_scale
 from mereo.visualization.contact_sheets import MOST_DEPTH_PX, PNG_URL, Picture, data_url, depth_data
 from mereo.visualization.previews import CAMERA_VIEWS, points_on_segments
@@ -69,8 +70,9 @@ class Report:
         surfaces: the segments in the same frame; those without faces are listed but not drawn, those around a nested
             one are drawn see-through.
         summary: what the page says in words; every key may be missing. ``title`` is text; ``segments`` is a list of
-            ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``; ``timings_s``
-            maps stages to seconds; facts of it are listed (``page_words``).
+            ``{"name", "centroid" [3], "volume", "confidence" in 0..1}`` in the order of ``surfaces``; ``joints`` has
+            facts of a ``JointValue`` by name; ``timings_s`` maps stages to seconds; facts of it are listed
+            (``page_words``).
         rotation: rotation from the input's frame to the viewer's (x right, y up, z toward the viewer).
         unit: of the cloud's lengths; the page has millimetres and cubic centimetres where it is known.
         registered: the model that the last of ``surfaces`` are, in the cloud's frame, to show how sure they are.
@@ -312,7 +314,8 @@ def page_words(summary: Facts, unit: Unit) -> JsonObject:
 
     Returns ``title``, ``trust`` (level, verdict and why), ``facts`` (phrases), ``warnings`` (sentences), ``heads``
     (of the table), ``units`` (of its lengths and volumes), ``rows`` (centre, volume and confidence of each segment;
-    confidence is None where there is none), ``weights`` (their name) and ``timings_s``, seconds of each stage in words.
+    confidence is None where there is none), ``joints`` (their values by name), ``weights`` (their name) and
+    ``timings_s``, seconds of each stage in words.
     """
     verdict = trust(summary)
     times = {name: _number(seconds) for name, seconds in dict(summary.get("timings_s") or {}).items()}
@@ -324,9 +327,28 @@ def page_words(summary: Facts, unit: Unit) -> JsonObject:
         "heads": _heads(summary, unit),
         "units": [unit.length_name, unit.volume_name],
         "rows": [_row(segment, unit) for segment in summary.get("segments") or ()],
+        "joints": {name: str(joint) for name, joint in stated_joints(summary).items()},
         "weights": str(summary.get("weights") or ""),
         "timings_s": {STAGES.get(name, name): value for name, value in times.items() if value is not None},
     }
+
+
+def stated_joints(summary: Facts) -> JointValues:
+    """Values of the joints that a summary states; none where the object has none."""
+    return {
+        name: JointValue(
+            each["value"], each["interval"] and tuple(each["interval"]), each["unit"], tuple(each["limits"])
+        )
+        for name, each in summary.get("joints", {}).items()
+    }
+
+
+def joint_table(joints: Mapping[str, JointValue | str]) -> str:
+    """HTML of a table of joints with their values, or the words of these; empty without any."""
+    cell = '</td><td style="text-align:left;padding-left:1em">'
+    rows = (f"<tr><td>{escape(name)}{cell}{escape(str(value))}</td></tr>" for name, value in joints.items())
+    head = "<tr><th>joint</th><th>value, 95\N{NO-BREAK SPACE}% range</th></tr>"
+    return f"<table>{head}{''.join(rows)}</table>" if joints else ""
 
 
 def _heads(summary: Facts, unit: Unit) -> list[str]:
@@ -467,6 +489,7 @@ class WrittenReport:
         title: of the page.
         level: of the verdict.
         verdict: the verdict and why, then what to do: sentences.
+        joints: values of the object's joints by name, in words.
         cloud: the observed points in the input's frame and unit, to 16 bits of the box of all, as many as are shown.
         count: number of points of the input.
         depth: the depth image as a picture; None without one.
@@ -477,6 +500,7 @@ class WrittenReport:
     title: str
     level: Level
     verdict: str
+    joints: dict[str, str]
     cloud: PointCloud | None
     count: int
     depth: Picture | None
@@ -503,6 +527,7 @@ def read_report(path: Path) -> WrittenReport | None:
             title=str(words["title"]),
             level=level,
             verdict=" ".join([*sentences, *words["warnings"]]),
+            joints={name: str(value) for name, value in words.get("joints", {}).items()},
             cloud=PointCloud(low + steps / STEPS * (high - low)) if len(steps) else None,
             count=int(page["cloud"]["count"]),
             depth=None if page["depth"] is None else _picture(page["depth"]["url"]),
@@ -559,7 +584,7 @@ def result_html(
     return (
         f'<div><p style="margin:0 0 6px"><b>{title}</b><br>{text}</p>'
         f'<div style="display:flex;gap:8px;flex-wrap:wrap">{figures}</div>'
-        f"{_table(summary, surfaces, unit)}</div>"
+        f"{_table(summary, surfaces, unit)}{joint_table(stated_joints(summary))}</div>"
     )
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from mereo.geometry.brief import as_exact_as, rounded
+from mereo.geometry.brief import as_exact_as, between, rounded
 from mereo.geometry.transforms import Vector
 
 
@@ -45,14 +45,13 @@ class Unit:
         *near, off = as_exact_as(radius * self.length_factor, *values, radius * self.length_factor)
         return f"{' '.join(near)} ± {off}"
 
-    def volume(self, volume: float, between: Sequence[float] | None = None) -> str:
-        """Volume of the frame, without the unit's name; with its bounds all as exact as they are wide, and these."""
+    def volume(self, volume: float, bounds: Sequence[float] | None = None) -> str:
+        """Volume of the frame, without the unit's name; with its bounds to the digits of their width, four at most."""
         value = volume * self.volume_factor
-        if between is None:
+        if bounds is None:
             return rounded(value)
-        low, high = (bound * self.volume_factor for bound in between)
-        middle, least, most = as_exact_as(high - low, value, low, high)
-        return f"{middle} ({least} to {most})"
+        low, high = (bound * self.volume_factor for bound in bounds)
+        return between(value, low, high)
 
 
 UNKNOWN = Unit(None)
