@@ -22,11 +22,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
-from bank_views import CONDITIONS, OBJECTS, OTHERS, SHIPPED, BankView, bank_view, scene_of
+from bank_views import CONDITIONS, OBJECTS, OTHERS, BankView, bank_view, scene_of
 from jaxtyping import Float
+from search import OBJECTS as SHIPPED
 
 from mereo.fitting import modes, search
 from mereo.fitting.draws import fit as draws_fit
@@ -71,7 +73,6 @@ WITHIN: dict[str, str] = {
     "shaken": "shaken",
     "explored": "explored",
     "in_problem": "noisy",
-    "again": "noisy",
     "with_heavier_cloud": "heavier",
     "fit_rest": "rest",
     "settled": "settled",
@@ -122,11 +123,11 @@ class Recorder:
 
 def stage_of_caller() -> str:
     """Stage of what is scored, by the functions of the fit that are at work."""
-    frame = sys._getframe(2)
+    frame: FrameType | None = sys._getframe(2)
     while frame is not None:
         if frame.f_code.co_name in WITHIN:
             return WITHIN[frame.f_code.co_name]
-        frame = frame.f_back  # type: ignore[assignment]
+        frame = frame.f_back
     return "fitted"
 
 

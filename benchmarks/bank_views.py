@@ -14,7 +14,7 @@ import numpy as np
 import trimesh
 from bank_objects import OWN, own_scene, things
 from jaxtyping import Bool, Float, Int
-from occluded_views import occlude
+from occluded_views import Occluding, occlude, surroundings
 from scipy import ndimage
 from scipy.spatial.transform import Rotation
 from search import CUTS as EVERY_CUT
@@ -30,7 +30,7 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
-from mereo.synthesis.clutter import OBJECT, Backdrop, Surroundings
+from mereo.synthesis.clutter import OBJECT, Backdrop
 from mereo.synthesis.config import SENSORS, GenerateConfig, SensorConfig
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View, sample_view
@@ -115,7 +115,7 @@ def bank_view(name: str, condition: str, number: int) -> BankView:
 
 def sensor_of(scene: Scene, camera: str) -> SensorConfig:
     """Errors of a simulated camera at the object's size; a stereo camera's are added afterwards."""
-    chosen = SENSORS[camera] if camera in ("structured-light", "time-of-flight") else SensorConfig()  # type: ignore[index]
+    chosen = next((sensor for name, sensor in SENSORS.items() if name == camera), SensorConfig())
     return replace(chosen, metres_per_unit=unit_m(scene), background=0.0)
 
 
@@ -302,7 +302,7 @@ def dropped(mesh: SegmentedMesh, turn: Float[np.ndarray, "3 3"]) -> Placed:
 
 
 class Thing:
-    """Something in front of or beside the object, as ``clutter.Surroundings`` take it."""
+    """Something in front of or beside the object, as ``surroundings`` take it."""
 
     def __init__(self, mesh: SegmentedMesh) -> None:
         self.solids = Solids(mesh)
@@ -357,9 +357,9 @@ def desk_view(scene: Scene, condition: str, number: int, rng: np.random.Generato
         is_other = condition in ("desk-thing", "desk-empty")
         shown, beside = (others[0], others[1:]) if is_other else (own, others)
         beside = [own, *beside] if condition == "desk-thing" else beside
-        parts = (*(Thing(each.mesh.transformed(T)) for each in beside), wall)
+        parts: list[Occluding] = [*(Thing(each.mesh.transformed(T)) for each in beside), wall]
         solids = Solids(shown.mesh.transformed(T))
-        around = Surroundings(parts, Backdrop(-up, float(eye[2])))  # type: ignore[arg-type]
+        around = surroundings(parts, Backdrop(-up, float(eye[2])))
         alone = np.isfinite(solids.first_hit(image.directions().reshape(-1, 3)).distance).sum()
         measured = observe(solids, image, 0.0 if sensor.on else 0.1, sensor, rng, around=around)
         if (measured.source == OBJECT).sum() < 0.6 * alone or alone < 4 * MIN_POINTS:

@@ -111,11 +111,9 @@ def query_scores(model: Model, data: Dataset) -> dict[str, Scores]:
         return network.query(code, batch.positions).logits.softmax(dim=-1)
 
     def averaged(index: Int[Tensor, " b"], batch: Batch) -> Float[Tensor, "b q c"]:
-        draws = Draws.of(0)
-        clouds = [
-            choose_points(data.cloud[index], data.count[index], network.config.points, FEWER, draws)
-            for _ in range(CLOUDS)
-        ]
+        draws, stored = Draws.of(0), data.read(index)
+        seen = stored["cloud"], stored["cloud_count"].long()
+        clouds = [choose_points(*seen, network.config.points, FEWER, draws) for _ in range(CLOUDS)]
         return torch.stack([answer(replace(batch, cloud=cloud)) for cloud in clouds]).mean(dim=0)
 
     ways: dict[str, tuple[Tensor, Callable[[Tensor, Batch], Tensor]]] = {

@@ -99,7 +99,7 @@ def row(
         near, far = errors(best, case)
         seen.append(near)
         hidden.append(far)
-        values = (alone.iou, alone.miou, *fitted(modes, grid), *fitted(best, grid))
+        values = (alone.iou, alone.miou, *fitted(modes.registration, grid), *fitted(best, grid))
         table.append((*values, modes.seconds, best.seconds, best.accepted, best.method == "draws", best.explained))
         print(f"  {case.name}: " + " ".join(f"{float(value):.3f}" for value in table[-1]), flush=True)
     mean, middle = np.mean(table, axis=0), np.median(table, axis=0)

@@ -17,6 +17,7 @@ import argparse
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from functools import partial
 from statistics import median
 from typing import Any
 
@@ -112,8 +113,8 @@ def compare(scene: Scene, examples: int) -> None:
     rival_example(scene, SETTINGS, example_rng(0, 0))
     ours, rival = [], []
     for index in range(examples):
-        ours.append(seconds(lambda index=index: synthesize(scene, SETTINGS, example_rng(1, index))))  # type: ignore[misc]
-        rival.append(seconds(lambda index=index: rival_example(scene, SETTINGS, example_rng(1, index))))  # type: ignore[misc]
+        ours.append(seconds(partial(synthesize, scene, SETTINGS, example_rng(1, index))))
+        rival.append(seconds(partial(rival_example, scene, SETTINGS, example_rng(1, index))))
     parts = len(scene.rest.segments)
     print(
         f"\n{scene.name}: {parts} segments, {sum(len(s.faces) for s in scene.rest.segments)} faces, {examples} examples"

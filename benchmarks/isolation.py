@@ -18,7 +18,7 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object, observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.synthesis.config import SENSORS, GenerateConfig
+from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.examples import sample_view
 from mereo_learning.scoring import predict_grid, trained_scene
 
@@ -30,7 +30,7 @@ WAYS = {
 }
 
 
-def measure(weights: str, sensor: str, views: int, cells: int) -> None:
+def measure(weights: str, sensor: Sensor, views: int, cells: int) -> None:
     """Print a row of the table for each way."""
     model = load_model(weights)
     scene = load_scene(trained_scene(model)).for_seed(TEST_SEED_START)
@@ -38,7 +38,7 @@ def measure(weights: str, sensor: str, views: int, cells: int) -> None:
     kept: dict[str, list[float]] = {way: [] for way in WAYS}
     spent = dict.fromkeys(WAYS, 0.0)
     for index in range(views):
-        settings = GenerateConfig(sensor=SENSORS[sensor])  # type: ignore[index]
+        settings = GenerateConfig(sensor=SENSORS[sensor])
         view = sample_view(scene, settings, example_rng(TEST_SEED_START, index))
         cloud, truth = view.depth.to_points(), truth_grid(view.mesh, cells)
         for way, config in WAYS.items():

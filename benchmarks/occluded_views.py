@@ -6,10 +6,10 @@ For trials of registration where the object's outline is not its silhouette. The
 depth image that the same camera would take of the object alone.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Literal, Protocol, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -35,6 +35,13 @@ NEARER = 0.95
 
 WALL_SIZES = 1.5
 """Distance between the object and the wall behind it, in longest sides of the object."""
+
+
+class Occluding(Protocol):
+    """What a ray may meet before the object."""
+
+    def first_hit(self, directions: Float[np.ndarray, "n 3"]) -> tuple[Int[np.ndarray, " m"], Hits]:
+        """Rows of the rays from the origin that hit it, and where."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +127,7 @@ def occlude(
         raise ValueError("the view shows 0 pixels of the object; at least one must be visible: take another view")
     rays, seen = directions[visible], Hits(hits.distance[visible], hits.normal[visible])
     placing, measuring = rng.spawn(2)
-    occluders: Sequence[Capsule | Screen] = ()
+    occluders: Sequence[Occluding] = ()
     if kind == "screen":
         occluders = (screen_hiding(share, rays, seen, placing),)
     elif kind == "picture":
@@ -133,12 +140,17 @@ def occlude(
     if wall:
         away = np.array([0.0, 0.0, 1.0])
         backdrop = Backdrop(away, farthest(solids, away) + WALL_SIZES * float(np.ptp(view.mesh.bounds, axis=0).max()))
-    around = Surroundings(tuple(occluders), backdrop)
+    around = surroundings(occluders, backdrop)
     measured = observe(solids, camera, settings.noise_std, settings.sensor, measuring, around=around)
     hidden = 1 - int((measured.source == OBJECT).sum()) / int(visible.sum())
     return OccludedView(
         view.mesh, measured.whole, measured.mask, measured.source, render_depth(solids, camera), max(hidden, 0.0)
     )
+
+
+def surroundings(parts: Iterable[Occluding], backdrop: Backdrop | None) -> Surroundings:
+    """Surroundings of anything that rays can hit; mereo's own have capsules alone."""
+    return Surroundings(cast("tuple[Capsule, ...]", tuple(parts)), backdrop)
 
 
 def screen_hiding(share: float, rays: Float[np.ndarray, "n 3"], seen: Hits, rng: np.random.Generator) -> Screen:

@@ -95,7 +95,7 @@ class Mereo:
         if done.returncode not in (0, 3, 4):
             raise RuntimeError(done.stderr)
         seconds = time.perf_counter() - start
-        surface = trimesh.load(self.place / "out" / "segments.ply", process=False)
+        surface = trimesh.load_mesh(self.place / "out" / "segments.ply", process=False)
         vertices = np.asarray(surface.vertices)
         radii = self.radii(vertices, frame, scene, None if known == "search" else np.eye(4))
         return vertices, np.asarray(surface.faces, dtype=np.int64), radii, seconds
@@ -103,12 +103,16 @@ class Mereo:
     def radii(self, vertices: np.ndarray, frame: str, scene: str, pose: np.ndarray | None) -> np.ndarray:
         """95 % radii at the vertices of the last answer, which no file of a result has."""
         result = mereo.reconstruct(frame, str(self.place / scene), unit_m=0.001, initial_pose=pose)
-        return result.registered.radius95(vertices, at="camera")
+        assert result.registered is not None
+        radii = result.registered.radius95(vertices, at="camera")
+        assert radii is not None
+        return radii
 
 
 def quarter_level(rest: trimesh.Trimesh) -> float:
     """Height (y) below which a quarter of the volume lies, the same in every run: what is held decides the answer."""
-    points = np.random.default_rng(0).uniform(*rest.bounds, size=(200_000, 3))
+    low, high = rest.bounds
+    points = np.random.default_rng(0).uniform(low, high, (200_000, 3))
     inside = igl.fast_winding_number(np.asarray(rest.vertices), np.asarray(rest.faces, dtype=np.int64), points) > 0.5
     return float(np.quantile(points[inside, 1], 0.75))
 
@@ -237,7 +241,7 @@ class Truth:
 
 
 def load(folder: Path, name: str) -> trimesh.Trimesh:
-    return trimesh.load(folder / f"{name}.stl")
+    return trimesh.load_mesh(folder / f"{name}.stl")
 
 
 def measured(folder: Path, which: str) -> Points:
@@ -275,8 +279,9 @@ def main() -> None:
                 row, spent = truth.line(coherent_point_drift(vertices, cloud), faces), time.perf_counter() - start
                 print(f"| {which} | pose given | coherent point drift | {row} | {spent:.1f} |", flush=True)
             for known in ("search", "pose given", "underside held"):
-                *surface, radii, spent = answer(which, known)
-                print(f"| {which} | {known} | mereo | {truth.line(*surface, radii)} | {spent:.1f} |", flush=True)
+                moved, triangles, radii, spent = answer(which, known)
+                row = truth.line(moved, triangles, radii)
+                print(f"| {which} | {known} | mereo | {row} | {spent:.1f} |", flush=True)
 
 
 if __name__ == "__main__":

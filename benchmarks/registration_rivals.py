@@ -142,7 +142,7 @@ def theirs(view: Prepared, rivals: dict[str, Rival], start: str, grid: TruthGrid
         for suffix, settings in variants.items():
             found, seconds = attempt(rival, settings, view)
             model = view.rest.model
-            answer = Registration(model, found.material, "modes", np.empty(0), 1.0, np.nan, True, seconds)
+            answer = Registration(model, found.material, "modes", np.empty(0), 1.0, True, np.nan, True, seconds)
             table[f"{name}{suffix} ({start})"] = scored(answer, view.case, grid, found.finished)
     return table
 

@@ -39,7 +39,7 @@ from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
-from mereo.synthesis.config import OBSERVATIONS, GenerateConfig
+from mereo.synthesis.config import OBSERVATIONS, GenerateConfig, ObservationName
 from mereo.synthesis.examples import sample_view
 
 OBJECTS = ("bunny", "engine", "human", "liver", "lizard", "robot", "rope", "shapes", "sheet", "skull", "tumor")
@@ -52,7 +52,7 @@ CUTS: dict[str, tuple[Cut, float]] = {
     "hand30": ("hand", 0.3),
 }
 
-CAMERAS = {
+CAMERAS: dict[str, tuple[ObservationName, int]] = {
     "structured-light": ("structured-light", 96),
     "time-of-flight": ("time-of-flight", 96),
     "structured-light-192": ("structured-light", 192),

@@ -15,10 +15,11 @@ import tyro
 from occluded_views import occlude
 
 from mereo.fitting.config import FitConfig
+from mereo.fitting.modes import bend_by_few
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import NetworkTerm
-from mereo.fitting.search import ROUNDS, candidates, screen_poses, search
+from mereo.fitting.search import ROUNDS, screen_poses, search
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
@@ -61,7 +62,7 @@ def main(options: Options) -> None:
     evidence = Evidence.of(seen.cloud.points, lines=seen.lines)
     problem = Problem(model, NetworkTerm.none(model), evidence, KNOWN_SCALE_STD, FitConfig())
     rigid = screen_poses(problem, ROUNDS[0])
-    bent = candidates(problem, ROUNDS[0])
+    bent = bend_by_few(problem, rigid, ROUNDS[0].fitted)
     found = search(problem)
     states = (rigid[-1], rigid[0], bent[0][1], found.best.posed)
     points = evidence.points
@@ -73,7 +74,7 @@ def main(options: Options) -> None:
         canvas.draw_points(points, np.broadcast_to(BLACK, points.shape), 1.0)
         tiles.append(canvas.picture())
     save_png(options.output, np.concatenate(tiles, axis=1))
-    print(f"{found.alike} candidates explain the frame; wrote {options.output}")
+    print(f"{1 + len(found.others)} candidates explain the frame; wrote {options.output}")
 
 
 def sight_picture(seen: Observation) -> np.ndarray:

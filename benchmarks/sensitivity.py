@@ -194,8 +194,9 @@ class Study:
             self.run(numbers[half:])
             return
         for number in numbers:
-            largest = round(max(changes, key=abs, default=0.0), 4)
-            kept[str(number)] = {"matters": matters, "change": round(mean, 5), "views": len(changes), "most": largest}
+            largest = max([0.0, *changes], key=abs)
+            facts = {"change": round(mean, 5), "views": len(changes), "most": round(largest, 4)}
+            kept[str(number)] = {"matters": matters, **facts}
             print(
                 f"{'matters' if matters else 'no effect':9} {number!s:60}  {mean:+.4f}, a view {largest:+.3f}",
                 flush=True,

@@ -10,7 +10,7 @@ CPU time of whole examples with the paper's sensor is printed for comparison, wi
 
 import argparse
 import time
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -23,9 +23,9 @@ from mereo.synthesis.config import SENSOR_TERMS, SENSORS, GenerateConfig, Sensor
 from mereo.synthesis.depth_sensor import observe
 from mereo.synthesis.examples import View, sample_view, synthesize
 
-SENSORS_BY_NAME: dict[str, SensorConfig] = {**SENSORS} | {  # type: ignore[dict-item]
-    name: replace(SensorConfig(), **{name: 1.0}) for name in SENSOR_TERMS
-}
+SENSORS_BY_NAME: dict[str, SensorConfig] = dict(
+    [*SENSORS.items(), *((name, SensorConfig(**dict[str, Any]({name: 1.0}))) for name in SENSOR_TERMS)]
+)
 ROUNDS = 3
 OBSERVED = GenerateConfig(observations=("all",))
 

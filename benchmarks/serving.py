@@ -126,7 +126,7 @@ def client(
     """Ask for frames in a random order while it is wanted; refused ones are asked for again."""
     rng, line = np.random.default_rng(seed), http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     while wanted():
-        frame = frames[rng.integers(len(frames))]
+        frame = frames[int(rng.integers(len(frames)))]
         start = time.perf_counter()
         try:
             line.request("POST", address.format(weights=frame.weights), frame.content, HEADERS)

@@ -29,7 +29,8 @@ POINTS = 1500
 
 
 def interior(rest: SegmentedMesh, index: int, rng: np.random.Generator) -> np.ndarray:
-    draws = rng.uniform(*rest.segments[index].bounds, size=(20 * POINTS, 3))
+    low, high = rest.segments[index].bounds
+    draws = rng.uniform(low, high, (20 * POINTS, 3))
     return draws[Solids(rest).inside(index, draws)][:POINTS]
 
 

@@ -125,6 +125,7 @@ def page_opener(watched: Watched, held: int) -> Callable[[int], None]:
     """
     import viser
     from websockets.sync.client import connect
+    from websockets.typing import Origin, Subprotocol
 
     assert watched.process.stdout is not None
     for line in watched.process.stdout:
@@ -136,8 +137,9 @@ def page_opener(watched: Watched, held: int) -> Callable[[int], None]:
 
     def open_page(_: int) -> None:
         start = time.perf_counter()
-        protocol = [f"viser-v{viser.__version__}"]
-        page = connect(f"ws://{address}", origin=f"http://{address}", subprotocols=protocol, max_size=None)
+        protocol = [Subprotocol(f"viser-v{viser.__version__}")]
+        origin = Origin(f"http://{address}")
+        page = connect(f"ws://{address}", origin=origin, subprotocols=protocol, max_size=None)
         page.recv(timeout=60)
         watched.latencies.put(time.perf_counter() - start)
         pages.append(page)
@@ -164,7 +166,7 @@ def soak(options: argparse.Namespace) -> list[Watched]:
             (every, (1 / options.rate, end, write_frames(Path(folder), options.weights))),
             (every, (1 / options.pages, end, opener)),
         ):
-            threads.append(threading.Thread(target=target, args=arguments, daemon=True))  # type: ignore[arg-type]
+            threads.append(threading.Thread(target=target, args=arguments, daemon=True))
             threads[-1].start()
         try:
             _measure(both, options)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 import mereo
 from mereo.geometry.camera import Camera, DepthImage
-from mereo.geometry.conventions import Way
+from mereo.geometry.conventions import LengthUnit, Way
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import rigid
@@ -87,7 +87,7 @@ def main(
     input: Path | None = None,
     intrinsics: Path | None = None,
     object: tuple[str, ...] = ("bunny",),
-    units: str | None = None,
+    units: LengthUnit | None = None,
     way: Way = "auto",
     output: Path = Path("out/whole_frame.png"),
     force: bool = False,
@@ -100,7 +100,7 @@ def main(
             model = mereo.load_object(load_scene("bunny"))
         else:
             frame = mereo.load_frame(input, intrinsics=intrinsics)
-            model = mereo.load_object(list(object), units=units, deformations=way)  # type: ignore[arg-type]
+            model = mereo.load_object(list(object), units=units, deformations=way)
         result = mereo.reconstruct(frame, model)
     except (OSError, ValueError) as error:
         raise SystemExit(f"error: {error}") from None

@@ -16,8 +16,8 @@ from rivals.methods import (
 )
 
 COMMON: Settings = {"facing": False, "count": 500}
-MIXTURE = {"facing": [True], "sigma2": [0.1, 0.02, 0.005], "w": [0.1, 0.3]}
-ATLAS = {"facing": [True], "sigma2": [0.1, 0.02, 0.005], "outlier_weight": [0.1, 0.3]}
+MIXTURE: dict[str, list[Any]] = {"facing": [True], "sigma2": [0.1, 0.02, 0.005], "w": [0.1, 0.3]}
+ATLAS: dict[str, list[Any]] = {"facing": [True], "sigma2": [0.1, 0.02, 0.005], "outlier_weight": [0.1, 0.3]}
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,7 +21,7 @@ from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.segments import Joints
 from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import transform_points, unit_rows
 from mereo.scenes.parameters import random_state
 from mereo.scenes.random_states import build_model, scene_model, state_points
 from mereo.scenes.registry import load_scene
@@ -74,6 +74,34 @@ def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
 
 def test_a_scene_without_discrete_draws_has_no_others() -> None:
     assert redraw_choices(toy_scene(), Drawn.of(toy_scene(), 1001), 10) == []
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    by: np.ndarray
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        return points + self.by
+
+
+def sample_moves(rng: Generator) -> tuple[Deformation, ...]:
+    """Moves by a direction, by rows and a rest that are directions, and by normal numbers that are none."""
+    toward, wave = named(rng, "toward").normal(size=(1, 3)), named(rng, "waves").normal(size=(4, 3))
+    sides, shares = unit_rows(wave[:2]), wave[2:] / norm(wave[2:])
+    amounts = named(rng, "amounts").normal(size=3)
+    return tuple(Moved(2 * unit_rows(toward)[0] + sides[i % 2] + 3 * shares[i % 2] + amounts) for i in range(4))
+
+
+def test_what_is_a_direction_is_seen_by_what_its_length_moves() -> None:
+    scene = Scene("moves", rest_mesh(), sample_moves, Workspace())
+    states = DrawnStates.of(scene, scene_model(scene, 30, 1000), 4, 1000)
+    rows = {place[1].name: [row.tolist() for row in rows] for place, rows in states.directions.items()}
+    assert rows == {"toward": [[0, 1, 2]], "waves": [[0, 1, 2], [3, 4, 5], [6, 7, 8, 9, 10, 11]], "amounts": []}
+    drawn, plain = states.drawn(1001), Drawn.of(scene, 1001)
+    assert_allclose([norm(drawn.z[row]) ** 2 for row in drawn.directions], [1, 1, 1, 2.5])
+    assert_allclose(drawn.z[-3:], plain.z[-3:])
+    before, after = (states.played.moved(plain.deformations(scene, z) or ()) for z in (plain.z, drawn.z))
+    assert_allclose(after, before, atol=1e-6)
 
 
 def states_with(model: StatisticalModel, box: int, count: int) -> DrawnStates:

@@ -127,7 +127,8 @@ class ObjectTracker(Node):
         header = message.header
         if not header.frame_id:
             raise ValueError("the message names no frame; poses need one: set frame_id in the driver")
-        frame, reading = message, {"drop_invalid": True}
+        reading: dict[str, Any] = {"drop_invalid": True}
+        frame = message
         if self.stated["input"] == "depth":
             if self.info is None:
                 raise ValueError("no camera_info has come; a depth image needs it: remap camera_info")

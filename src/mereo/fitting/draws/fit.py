@@ -18,7 +18,15 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights, spread
 from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
-from mereo.fitting.draws.playback import NO_DIRECTIONS, Directions, Drawn, DrawnStates, as_sparse, material_moved, shares_of
+from mereo.fitting.draws.playback import (
+    NO_DIRECTIONS,
+    Directions,
+    Drawn,
+    DrawnStates,
+    as_sparse,
+    material_moved,
+    shares_of,
+)
 from mereo.fitting.modes import refine, robust_poses
 from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space

@@ -36,7 +36,10 @@ LARGEST = 4.0
 """Standard deviations; farther out a share is 0 or 1."""
 
 
-Directions = Mapping[Place, tuple[slice, ...]]
+Numbers = Int[np.ndarray, " _"]
+"""Which of some draws."""
+
+Directions = Mapping[Place, Sequence[Numbers]]
 """Which numbers of the calls from a place are a direction each."""
 
 NO_DIRECTIONS: Directions = MappingProxyType({})
@@ -71,7 +74,7 @@ class Drawn:
     z: Float[np.ndarray, " d"]
     sizes: tuple[int, ...]
     smooth: Bool[np.ndarray, " d"]
-    directions: tuple[slice, ...] = ()
+    directions: tuple[Numbers, ...] = ()
 
     @classmethod
     def of(cls, scene: Scene, seed: int) -> "Drawn":
@@ -83,13 +86,11 @@ class Drawn:
         """The state of recorded calls; ``seed`` is that of what is not recorded."""
         sizes = tuple(len(call.shares) for call in calls)
         smooth = np.concatenate([np.full(len(call.shares), call.kind in SMOOTH) for call in calls])
-        firsts = np.cumsum((0, *sizes)).tolist()
-        found = tuple(
-            slice(first + part.start, first + part.stop)
-            for call, first in zip(calls, firsts, strict=False)
-            for part in directions.get(call.key[0], ())
-        )
-        drawn = cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth, found)
+        firsts = np.cumsum(sizes) - sizes
+        rows = [
+            first + row for call, first in zip(calls, firsts, strict=True) for row in directions.get(call.key[0], ())
+        ]
+        drawn = cls(seed, ndtri(np.concatenate([call.shares for call in calls])), sizes, smooth, tuple(rows))
         return replace(drawn, z=drawn.normalized(drawn.z))
 
     def normalized(self, z: Float[np.ndarray, " d"]) -> Float[np.ndarray, " d"]:
@@ -100,7 +101,7 @@ class Drawn:
         """
         z = z.copy()
         for each in self.directions:
-            z[each] *= np.sqrt((each.stop - each.start - 1) / 2) / max(float(np.linalg.norm(z[each])), SHORTEST)
+            z[each] *= np.sqrt((len(each) - 1) / 2) / max(float(np.linalg.norm(z[each])), SHORTEST)
         return z
 
     def deformations(
@@ -221,46 +222,42 @@ class DrawnStates:
         return replace(like, z=np.where(like.smooth, np.clip(answer, -2.0, 2.0), like.z))
 
 
-def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call]]) -> Directions:
-    """Find the normal draws that are directions: rows of a call's numbers, or all that are none of these together.
-
-    Half as long a direction moves nothing, turned round it does.
-    """
-    cases = dict[Place, list[tuple[Drawn, int]]]()
-    shapes = dict[Place, tuple[int, ...]]()
-    for calls in states:
-        drawn, ends = Drawn.recorded(calls, 0), np.cumsum([len(call.shares) for call in calls])
-        for call, end in zip(calls, ends.tolist(), strict=True):
-            if call.kind == "normal" and len(call.shares) > 1:
-                cases.setdefault(call.key[0], []).append((drawn, end - len(call.shares)))
-                shapes[call.key[0]] = call.shape
-
-    def moved(drawn: Drawn, part: slice, factor: float) -> float:
-        z = drawn.z.copy()
-        z[part] *= factor
-        both = [drawn.deformations(scene, each, checked=False) for each in (drawn.z, z)]
-        places = [played.moved(each) for each in both if each is not None]
-        return float(np.abs(places[0] - places[-1]).max()) if len(places) == 2 else np.inf
-
-    def is_direction(place: Place, part: slice) -> bool:
-        few = [(drawn, slice(first + part.start, first + part.stop)) for drawn, first in cases[place][:TRIED]]
-        return all(moved(*each, 0.5) < SAME for each in few) and any(moved(*each, -1.0) > SAME for each in few)
-
-    found = dict[Place, tuple[slice, ...]]()
-    for place, shape in shapes.items():
-        rows = [slice(first, first + shape[-1]) for first in range(0, int(np.prod(shape)), shape[-1])]
-        parts = [row for row in rows if is_direction(place, row)]
-        rest = slice(parts[-1].stop if parts else 0, rows[-1].stop)
-        parts += [rest] if rest.start < rest.stop and rest not in rows and is_direction(place, rest) else []
-        found[place] = tuple(parts)
-    return {place: parts for place, parts in found.items() if parts}
-
-
-TRIED = 4
-"""States in which draws are tried."""
-
 SAME = 1e-3
-"""Scene units by which places differ that are the same, in single precision."""
+"""Scene units up to which places are the same, which are in single precision."""
+
+
+def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call]]) -> Directions:
+    """Find the normal draws that are directions: rows of a call's numbers, or together all after the last such row.
+
+    Half as long a direction moves nothing, with its numbers in another order it does.
+    """
+    directions = dict[Place, list[Numbers]]()
+    for calls in states:
+        drawn, end = Drawn.recorded(calls, 0), 0
+        for call in calls:
+            end += len(call.shares)
+            if call.kind == "normal" and call.shape and call.key[0] not in directions:
+                numbers = np.arange(end - len(call.shares), end)
+                each = [row for row in numbers.reshape(-1, call.shape[-1]) if is_direction(scene, played, drawn, row)]
+                rest = numbers[len(each) * call.shape[-1] :]
+                each += [rest] if len(rest) and is_direction(scene, played, drawn, rest) else []
+                directions[call.key[0]] = [part - numbers[0] for part in each]
+    return directions
+
+
+def is_direction(scene: Scene, played: Played, drawn: Drawn, numbers: Numbers) -> bool:
+    """Whether some numbers of a state are a direction."""
+
+    def moves(other: Float[np.ndarray, " n"]) -> bool:
+        z = drawn.z.copy()
+        z[numbers] = other
+        before, after = (drawn.deformations(scene, each, checked=False) for each in (drawn.z, z))
+        if before is None or after is None:
+            return True
+        return not np.allclose(played.moved(before), played.moved(after), rtol=0.0, atol=SAME)
+
+    own = drawn.z[numbers]
+    return len(own) > 1 and moves(own[::-1]) and not moves(own / 2)
 
 
 def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:
