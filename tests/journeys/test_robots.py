@@ -3,6 +3,7 @@
 import json
 import pickle
 import re
+from collections.abc import Sequence
 from math import pi
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ from folder_contents import read_json, run_mereo
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from page_blocks import blocks
-from robot_files import LAPTOP, LAPTOP_SDF, write_gripper
+from robot_files import ARM, LAPTOP, LAPTOP_SDF, SALAMANDER, write_arm, write_gripper
 
 import mereo
 import mereo.__main__ as command_line
@@ -22,6 +23,7 @@ from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Range
+from mereo.geometry.mesh_check import examine
 from mereo.geometry.transforms import inverse_rigid
 from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
@@ -51,17 +53,22 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gripper(tmp_path_factory.mktemp("robots"))
 
 
-def write_frame(path: Path, scene: Scene, share: float, seed: int) -> float:
-    """Write a noisy depth image's cloud in metres of a scene whose only free joint is at a share of its range."""
+def write_frame(path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128) -> list[float]:
+    """Write the cloud in metres of a noisy depth image, so many pixels wide, of a scene whose free joints are at shares of their ranges."""
     motion = scene.sample_deformations
     assert isinstance(motion, RandomMotion) and scene.unit_m is not None
-    (leader,) = (joint for joint, _ in motion.joints.values() if not joint.follows)
-    mesh = scene.deform(motion.at({leader.name: share})).mesh
+    leaders = [joint for joint, _ in motion.joints.values() if not joint.follows]
+    given = {joint.name: share for joint, share in zip(leaders, shares, strict=True)}
+    mesh = scene.deform(motion.at(given)).mesh
     rng = default_rng(seed)
     seen = mesh.transformed(inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0))))
-    image = add_depth_noise(render_depth(seen, Camera.from_fov(128, 128, scene.workspace.fov_rad)), 0.1, rng)
+    image = add_depth_noise(render_depth(seen, Camera.from_fov(pixels, pixels, scene.workspace.fov_rad)), 0.1, rng)
     write_positions_ply(path, image.to_points().points * scene.unit_m)
-    return float(leader.limits[0] + share * np.ptp(leader.limits)) * (1.0 if leader.turns else scene.unit_m)
+    units = [1.0 if joint.turns else scene.unit_m for joint in leaders]
+    return [
+        float(joint.limits[0] + share * np.ptp(joint.limits)) * unit
+        for joint, share, unit in zip(leaders, shares, units, strict=True)
+    ]
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -97,6 +104,8 @@ def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> 
         low, high = robot.mesh.bounds
         assert_allclose([*low, *high[:2]], [-0.15, -0.1, -0.01, 0.15, 0.1], atol=1e-9)
         assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
+        path.write_text(text.replace("0.015", "0.0005"))
+        assert all(examine(segment).sound for segment in read_robot(path).mesh.segments)  # however small
 
 
 BALL = "<collision><geometry><sphere radius='0.4'/></geometry></collision></link>"
@@ -297,6 +306,34 @@ def test_a_robot_is_named_alone_and_an_sdf_file_has_one_model(gripper: Path, tmp
         mereo.load_object(path)
 
 
+@pytest.mark.skipif(not SALAMANDER.is_file(), reason="MEREO_ASSETS holds no lizard/salamander.sdf")
+def test_a_real_file_of_gazebo_loads_with_its_capsules_of_a_millimetre() -> None:
+    robot = read_robot(SALAMANDER)
+    assert len(robot.mesh.names) == 25 and len(robot.joints) == 30 and robot.notes == ()
+    assert all(examine(segment).sound for segment in robot.mesh.segments)
+    assert_allclose(np.ptp(robot.mesh.bounds, axis=0), [0.1003, 0.0324, 0.0081], atol=1e-4)
+    assert {joint.turns for joint in robot.joints} == {True}
+    limits = {joint.name: joint.limits for joint in robot.joints}
+    assert_allclose([limits["joint_body_0"], limits["joint_leg_1_R_3"]], [[-pi / 2, pi / 2], [-pi, pi]], atol=1e-6)
+
+
+needs_arm = pytest.mark.skipif(not ARM.is_file(), reason="MEREO_ASSETS holds no robot/so101_new_calib.urdf")
+
+
+@needs_arm
+def test_a_real_arm_loads_with_its_links_joints_and_limits(tmp_path: Path) -> None:
+    robot = read_robot(write_arm(tmp_path / "arm.urdf"))
+    links = ("base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "moving_jaw_so101_v1")
+    assert robot.mesh.names == tuple(f"{link}_link" for link in links) and robot.notes == ()
+    assert_allclose(np.ptp(robot.mesh.bounds, axis=0), [0.4295, 0.1109, 0.2681], atol=1e-4)
+    degrees = {joint.name: np.rad2deg(joint.limits).round().tolist() for joint in robot.joints}
+    assert degrees == {
+        "gripper": [-10, 100], "wrist_roll": [-157, 163], "wrist_flex": [-95, 95], "elbow_flex": [-97, 97],
+        "shoulder_lift": [-100, 100], "shoulder_pan": [-110, 110],
+    }  # fmt: skip
+    assert [len(joint.moved) for joint in robot.joints] == [1, 2, 3, 4, 5, 6]
+
+
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
@@ -304,7 +341,7 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
     (tmp_path / "laptop.urdf").write_text(LAPTOP)
     laptop = mereo.load_object(tmp_path)  # the folder of a robot's file
     assert laptop.scene is not None
-    true = write_frame(tmp_path / "frame.ply", laptop.scene, 0.6, 0)
+    (true,) = write_frame(tmp_path / "frame.ply", laptop.scene, [0.6], 0)
     assert true == pytest.approx(0.3 + 0.6 * 1.9)  # the file's angle, although its rest pose is closed
     result = mereo.reconstruct(tmp_path / "frame.ply", laptop, unit_m=1.0)
     joint = result.joints["hinge"]
@@ -320,11 +357,23 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
     assert re.fullmatch(r"82\.\d+° \(82\.\d+ to 82\.\d+\)", str(joint))
 
 
+@needs_arm
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::mereo.io.mesh_formats.MeshWarning")
+def test_the_joints_of_a_real_arm_are_within_a_degree(tmp_path: Path) -> None:
+    arm = mereo.load_object(write_arm(tmp_path / "arm.urdf"))
+    assert arm.scene is not None
+    true = write_frame(tmp_path / "frame.ply", arm.scene, default_rng(2).uniform(0.1, 0.9, 6).tolist(), 2, 192)
+    result = mereo.reconstruct(tmp_path / "frame.ply", arm, unit_m=1.0)
+    values = [joint.value for joint in result.joints.values()]
+    assert result.known is True and np.rad2deg(np.abs(np.subtract(values, true))).max() < 1.0
+
+
 def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     gripper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.chdir(gripper.parent)
-    true = write_frame(Path("frame.ply"), scene_of_meshes([Path("gripper.urdf")]), 0.5, 2)
+    (true,) = write_frame(Path("frame.ply"), scene_of_meshes([Path("gripper.urdf")]), [0.5], 2)
     section = tmp_path / "section.md"
     section.write_text(PAGE.read_text().partition("## From a URDF or SDF")[2].partition("\n## ")[0])
     (commands,), (code,) = blocks(section, "bash"), blocks(section, "python")
@@ -352,7 +401,7 @@ def test_each_frame_of_a_stream_has_the_joints_of_its_moment(
 ) -> None:
     Path("frames").mkdir()
     scene = scene_of_meshes([gripper])
-    true = [write_frame(Path(f"frames/{i}.ply"), scene, 0.4 + 0.03 * i, 5) for i in range(6)]
+    true = [write_frame(Path(f"frames/{i}.ply"), scene, [0.4 + 0.03 * i], 5)[0] for i in range(6)]
     run_mereo("stream", "frames", "--object", gripper, "--unit-m", "1", "--every-frame")
     lines = [*map(json.loads, capsys.readouterr().out.splitlines())]
     assert [line["tracking"] for line in lines] == ["found", *["followed"] * 5]
@@ -483,7 +532,7 @@ def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
     capsys: pytest.CaptureFixture,
 ) -> None:
     assert known.scene is not None
-    true = write_frame(Path("frame.ply"), known.scene, 0.4, 5)
+    (true,) = write_frame(Path("frame.ply"), known.scene, [0.4], 5)
     free, fixed = (mereo.reconstruct("frame.ply", known, unit_m=1.0, joints=j) for j in (None, {"finger": true}))
     joints = fixed.joints
     assert joints["finger"].value == pytest.approx(true, abs=1e-12) and fixed.known is True
@@ -504,6 +553,6 @@ def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
 @pytest.mark.slow  # as nothing explains the frame, the search tries all it has
 def test_a_frame_that_contradicts_a_known_value_is_not_believed(known: mereo.Object, tmp_path: Path) -> None:
     assert known.scene is not None
-    true = write_frame(tmp_path / "frame.ply", known.scene, 0.4, 5)
+    (true,) = write_frame(tmp_path / "frame.ply", known.scene, [0.4], 5)
     result = mereo.reconstruct(tmp_path / "frame.ply", known, unit_m=1.0, joints={"finger": true + 0.01})
     assert result.known is False and result.joints["finger"].value == pytest.approx(true + 0.01, abs=1e-12)

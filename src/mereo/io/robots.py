@@ -253,7 +253,7 @@ def _geometry(yourdfpy: Any, element: Any) -> Any:
         return trimesh.creation.icosphere(3, _number(shape, "radius", ""))
     if shape.tag in ("cylinder", "capsule"):
         radius, length = (_number(shape, key, "") for key in ("radius", "length"))
-        return getattr(trimesh.creation, shape.tag)(radius=radius, height=length)
+        return trimesh.creation.cylinder(radius, length) if shape.tag == "cylinder" else _capsule(radius, length)
     raise ValueError(f"its <{element.tag}> {element.get('name')!r} is a {shape.tag}, which is not known")
 
 
@@ -335,10 +335,15 @@ def _mjcf_solids(model: Any, mujoco: Any, geom: int) -> Iterator[trimesh.Trimesh
     elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         yield trimesh.creation.cylinder(x, 2 * y)
     elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        yield trimesh.creation.capsule(2 * y, x)
+        yield _capsule(x, 2 * y)
     elif kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
         ball = trimesh.creation.icosphere(3)
         yield trimesh.Trimesh(ball.vertices * ([x, y, z] if y else x), ball.faces, process=False)
+
+
+def _capsule(radius: float, length: float) -> trimesh.Trimesh:
+    """Capsule, made with the radius 1: the library joins points that are nearer than 10 nm, as those of small ones."""
+    return trimesh.creation.capsule(length / radius, 1.0).apply_scale(radius)
 
 
 def _numbers(text: str | None, count: int) -> list[float]:
