@@ -24,7 +24,7 @@ from mereo.deformation.samplers import RandomMotion
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Range
 from mereo.geometry.mesh_check import examine
-from mereo.geometry.transforms import inverse_rigid
+from mereo.geometry.transforms import inverse_rigid, rigid
 from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.results.joints import JointValue
@@ -32,11 +32,11 @@ from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
-pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
+yourdfpy = pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
 
 PAGE = Path(__file__).parents[2] / "docs/own-object.md"
 
@@ -54,7 +54,7 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def write_frame(path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128) -> list[float]:
-    """Write the cloud in metres of a noisy depth image, so many pixels wide, of a scene whose free joints are at shares of their ranges."""
+    """Write the noisy depth cloud in metres of free joints at shares of their ranges; returns the values."""
     motion = scene.sample_deformations
     assert isinstance(motion, RandomMotion) and scene.unit_m is not None
     leaders = [joint for joint, _ in motion.joints.values() if not joint.follows]
@@ -89,6 +89,8 @@ def test_both_formats_give_links_in_metres_and_joints_by_name(gripper: Path, suf
     assert_allclose([finger.pivot, finger.axis], [[-0.01, 0, 0.047], [-1, 0, 0]], atol=1e-12)
     assert_allclose([follower.pivot, follower.axis], [[0.01, 0, 0.047], [1, 0, 0]], atol=1e-12)
     assert_allclose([finger.limits, follower.limits], [[0.003, 0.035], [0.0035, 0.0195]], atol=1e-12)
+    turned = [[0, -1, 0, 0.01], [1, 0, 0, 0], [0, 0, 1, 0.047], [0, 0, 0, 1]]
+    assert_allclose(robot.link_frames["right"], turned, atol=1e-12)
     left_out = ("joint 'spin' is left out, for it moves no segment against others",)
     assert robot.notes == (left_out if suffix == ".urdf" else ())
 
@@ -101,6 +103,7 @@ def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> 
         assert robot.mesh.names == ("base", "lid") and joint.turns and joint.moved == ("lid",)
         assert_allclose([joint.pivot, joint.axis], [[0, -0.1, 0.016], [1, 0, 0]], atol=1e-9)
         assert_allclose(joint.limits, (0.3, 2.2))
+        assert_allclose(robot.link_frames["lid"][:3, 3], [0, 0 if suffix == ".sdf" else -0.1, 0.016], atol=1e-12)
         low, high = robot.mesh.bounds
         assert_allclose([*low, *high[:2]], [-0.15, -0.1, -0.01, 0.15, 0.1], atol=1e-9)
         assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
@@ -174,6 +177,8 @@ def test_a_simulators_robot_has_its_joints_at_zero(tmp_path: Path) -> None:
     assert_allclose(joints["other"].limits, [0, 0.01])
     assert_allclose([joints["twist"].pivot, joints["twist"].axis], [[0.03, 0, 0.595], [0, 0, 1]], atol=1e-9)
     assert_allclose(joints["bend"].limits, [-0.5, 0.5])
+    assert_allclose(robot.link_frames["left"], rigid(np.eye(3), np.array([-0.03, 0, 0.51])), atol=1e-9)
+    assert_allclose(robot.link_frames["nail"], rigid(np.eye(3), np.array([0.03, 0, 0.595])), atol=1e-9)
     for old, new, message in (
         (
             '<joint name="finger"',
@@ -337,6 +342,13 @@ def test_a_real_arm_loads_with_its_links_joints_and_limits(tmp_path: Path) -> No
 # --- frames -----------------------------------------------------------------------------------------------------------
 
 
+def assert_kinematics(path: Path, result: mereo.Result, link: str, base: str) -> None:
+    """Assert that the pose of a link in another one is what the file says of the values that were found."""
+    robot = yourdfpy.URDF.load(str(path), load_meshes=False)
+    robot.update_cfg({name: result.joints[name].value for name in robot.actuated_joint_names if name in result.joints})
+    assert_allclose(result[link].pose_in(base), robot.get_transform(link, base), atol=1e-6)
+
+
 def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "laptop.urdf").write_text(LAPTOP)
     laptop = mereo.load_object(tmp_path)  # the folder of a robot's file
@@ -349,8 +361,10 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
     facts = FrameAnswer.of(result).facts  # what a line of a stream has
     assert facts["joints"] == {"hinge": joint.facts()}
     assert_allclose(facts["segments"]["lid"]["pose"], result["lid"].pose, atol=1e-6)
-    assert np.trace(result["lid"].pose_in("base")) == pytest.approx(2 + 2 * np.cos(joint.value), abs=1e-6)
-    assert pickle.loads(pickle.dumps(result)).joints == result.joints
+    assert_kinematics(tmp_path / "laptop.urdf", result, "lid", "base")
+    stored = pickle.loads(pickle.dumps(result))
+    assert stored.joints == result.joints
+    assert_allclose(stored["lid"].pose, result["lid"].pose)
     assert joint.interval is not None and joint.interval[0] < true < joint.interval[1]
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
     assert_allclose(joint.limits, (0.3, 2.2))
@@ -392,6 +406,11 @@ def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     result = variables["result"]
     assert isinstance(result, mereo.Result)
     assert result.joints["finger"].value == pytest.approx(facts["finger"]["value"], abs=1e-6)
+    assert_kinematics(Path("gripper.urdf"), result, "right", "palm")
+    assert_allclose(mereo.load_result("result")["right"].pose, result["right"].pose, atol=1e-6)
+    frame = load_scene("gripper.yaml").source_frame  # which the page's command has written
+    assert_allclose(SourceFrame.of_facts(frame.facts()).link_frames["right"][:3, 3], [0.01, 0, 0.047])
+    assert scene_of_meshes([Path("../meshes/palm.stl")]).link_frames == {}
     assert isinstance(held := variables["held"], mereo.Result) and held.known is True
     assert held.joints["finger"].interval == pytest.approx((true, true), abs=1e-12)
 

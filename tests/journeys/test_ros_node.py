@@ -154,6 +154,8 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     assert all(each.header.stamp is frame.header.stamp for each in node.sent if "header" in vars(each))
     sent = taken(node)
     assert_allclose(sent["object/palm"], T, atol=0.01)
+    right = T @ rigid(np.eye(3), np.array([0.012, 0, 0])) @ read_robot(robot).link_frames["right"]
+    assert_allclose(sent["object/right"], right, atol=0.01)
     joints = dict(zip(sent["JointState"].name, sent["JointState"].position, strict=True))
     assert joints == pytest.approx({"finger": 0.02, "other finger": 0.012}, abs=0.001)
     for marker, part in zip(sent["MarkerArray"].markers, mesh.segments, strict=True):
