@@ -21,6 +21,7 @@ import mereo
 import mereo.__main__ as command_line
 from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
+from mereo.fitting.problem.residuals import are_near
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Range
 from mereo.geometry.mesh_check import examine
@@ -472,7 +473,16 @@ def test_known_values_narrow_the_random_states_whoever_states_them(known: mereo.
     assert given_shares(known, {"finger": within}) == pytest.approx((0.0, 0.01 / 0.032))
     both = {"finger": within, "other finger": {"value": 0.006, "within": 0.001}}
     assert given_shares(known, both) == pytest.approx((0.003 / 0.032, 0.007 / 0.032))
-    assert known.with_joints({"finger": 0.02}) is known.with_joints(state)  # made once
+    assert (fixed := known.with_joints({"finger": 0.02})) is known.with_joints(state)  # made once
+    assert fixed.model is not None and not are_near(fixed.model)
+
+
+def test_an_angle_beyond_limits_is_named_as_it_was_given_and_links_are_rigid(tmp_path: Path) -> None:
+    (tmp_path / "laptop.urdf").write_text(LAPTOP)
+    laptop = mereo.load_object(tmp_path / "laptop.urdf", deformations="rigid")  # with a joint all the same
+    sentence = "joint 'hinge' is 86; its limits are 0.3 to 2.2 rad: give radians, correct it, or add `within`"
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        laptop.with_joints({"hinge": 86})
 
 
 def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> None:
@@ -487,7 +497,9 @@ def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> No
 
 NO_JOINTS = {
     "no joint is called 'fingr'; it must be one of other finger, finger: correct it": {"fingr": 0.02},
-    "joint 'finger' is 0.05; its limits are 0.003 to 0.035 m: correct it, or add `within`": {"finger": 0.05},
+    "joint 'finger' is 0.05; its limits are 0.003 to 0.035 m: give metres, correct it, or add `within`": {
+        "finger": 0.05
+    },
     "joint 'finger' is 'open'; it must be a finite number: give for example 0.1": {"finger": "open"},
     "joint 'finger' is nan; it must be a finite number": {"finger": float("nan")},
     "joint 'finger' is True; it must be a finite number": {"finger": True},
