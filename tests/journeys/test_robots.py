@@ -10,12 +10,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from folder_contents import read_json, run_mereo
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from page_blocks import blocks
 from robot_files import ARM, LAPTOP, LAPTOP_SDF, SALAMANDER, write_arm, write_gripper
+from trimesh.creation import box
 
 import mereo
 import mereo.__main__ as command_line
@@ -247,6 +249,19 @@ def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     assert "note: left and right overlap" in capsys.readouterr().out
 
 
+@pytest.mark.filterwarnings("ignore::mereo.io.mesh_formats.MeshWarning")
+def test_shells_of_a_link_that_overlap_are_no_fault_and_a_repair_unites_them(
+    working_folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    trimesh.util.concatenate([box((0.3, 0.2, 0.02)), box((0.1, 0.1, 0.05))]).export("base.stl")
+    Path("laptop.urdf").write_text(LAPTOP.replace('<box size="0.3 0.2 0.02"/>', '<mesh filename="base.stl"/>'))
+    run_mereo("scene", "new", "laptop.urdf")
+    assert run_mereo("scene", "check", "laptop.yaml") in (0, None)
+    assert "note: it intersects itself" in capsys.readouterr().out
+    run_mereo("scene", "check", "laptop.yaml", "--repair")
+    assert "repaired base: united 2 shells that overlap" in capsys.readouterr().out
+
+
 def test_joints_without_names_draw_as_before_and_names_are_checked(tmp_path: Path, gripper: Path) -> None:
     path = tmp_path / "gripper.yaml"
     run_mereo("scene", "new", gripper, "--output", path)
@@ -327,6 +342,7 @@ needs_arm = pytest.mark.skipif(not ARM.is_file(), reason="MEREO_ASSETS holds no 
 
 
 @needs_arm
+@pytest.mark.filterwarnings("ignore::mereo.io.mesh_formats.MeshWarning")
 def test_a_real_arm_loads_with_its_links_joints_and_limits(tmp_path: Path) -> None:
     robot = read_robot(write_arm(tmp_path / "arm.urdf"))
     links = ("base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "moving_jaw_so101_v1")
@@ -338,6 +354,8 @@ def test_a_real_arm_loads_with_its_links_joints_and_limits(tmp_path: Path) -> No
         "shoulder_lift": [-100, 100], "shoulder_pan": [-110, 110],
     }  # fmt: skip
     assert [len(joint.moved) for joint in robot.joints] == [1, 2, 3, 4, 5, 6]
+    run_mereo("scene", "new", tmp_path / "arm.urdf", "--output", tmp_path / "arm.yaml")
+    assert run_mereo("scene", "check", tmp_path / "arm.yaml") in (0, None)  # links of motors and brackets
 
 
 # --- frames -----------------------------------------------------------------------------------------------------------
