@@ -3,26 +3,31 @@
 import json
 import pickle
 import re
+from collections.abc import Sequence
 from math import pi
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import trimesh
 import yaml
 from folder_contents import read_json, run_mereo
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from page_blocks import blocks
-from robot_files import LAPTOP, LAPTOP_SDF, write_gripper
+from robot_files import ARM, LAPTOP, LAPTOP_SDF, SALAMANDER, write_arm, write_gripper
+from trimesh.creation import box
 
 import mereo
 import mereo.__main__ as command_line
 from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
+from mereo.fitting.problem.residuals import are_near
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Range
-from mereo.geometry.transforms import inverse_rigid
+from mereo.geometry.mesh_check import examine
+from mereo.geometry.transforms import inverse_rigid, rigid
 from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.results.joints import JointValue
@@ -30,12 +35,12 @@ from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.parameters import parameters, random_state
 from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
-from mereo.scenes.scene import Scene
+from mereo.scenes.scene import Scene, SourceFrame
 from mereo.scenes.seeds import example_rng
 from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 from mereo_viewer.result_page import content_of_answer, content_of_files
 
-pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
+yourdfpy = pytest.importorskip("yourdfpy", reason="yourdfpy is not installed: pip install 'mereo[robot]'")
 
 PAGE = Path(__file__).parents[2] / "docs/own-object.md"
 
@@ -52,17 +57,19 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gripper(tmp_path_factory.mktemp("robots"))
 
 
-def write_frame(path: Path, scene: Scene, share: float, seed: int) -> float:
-    """Write a noisy depth image's cloud in metres of a scene whose only free joint is at a share of its range."""
+def write_frame(path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128) -> list[float]:
+    """Write the noisy depth cloud in metres of free joints at shares of their ranges; returns the values."""
     motion = scene.sample_deformations
     assert isinstance(motion, RandomMotion) and scene.unit_m is not None
-    (leader,) = (joint for joint, _ in motion.joints.values() if not joint.follows)
-    mesh = scene.deform(motion.at({leader.name: share})).mesh
+    leaders = [joint for joint, _ in motion.joints.values() if not joint.follows]
+    given = {joint.name: share for joint, share in zip(leaders, shares, strict=True)}
+    mesh = scene.deform(motion.at(given)).mesh
     rng = default_rng(seed)
     seen = mesh.transformed(inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0))))
-    image = add_depth_noise(render_depth(seen, Camera.from_fov(128, 128, scene.workspace.fov_rad)), 0.1, rng)
+    image = add_depth_noise(render_depth(seen, Camera.from_fov(pixels, pixels, scene.workspace.fov_rad)), 0.1, rng)
     write_positions_ply(path, image.to_points().points * scene.unit_m)
-    return float(leader.limits[0] + share * np.ptp(leader.limits)) * (1.0 if leader.turns else scene.unit_m)
+    values = [joint.limits[0] + share * np.ptp(joint.limits) for joint, share in zip(leaders, shares, strict=True)]
+    return [float(value) * (1 if leaders[0].turns else scene.unit_m) for value in values]  # all turn, or all slide
 
 
 # --- files ------------------------------------------------------------------------------------------------------------
@@ -83,6 +90,8 @@ def test_both_formats_give_links_in_metres_and_joints_by_name(gripper: Path, suf
     assert_allclose([finger.pivot, finger.axis], [[-0.01, 0, 0.047], [-1, 0, 0]], atol=1e-12)
     assert_allclose([follower.pivot, follower.axis], [[0.01, 0, 0.047], [1, 0, 0]], atol=1e-12)
     assert_allclose([finger.limits, follower.limits], [[0.003, 0.035], [0.0035, 0.0195]], atol=1e-12)
+    turned = [[0, -1, 0, 0.01], [1, 0, 0, 0], [0, 0, 1, 0.047], [0, 0, 0, 1]]
+    assert_allclose(robot.link_frames["right"], turned, atol=1e-12)
     left_out = ("joint 'spin' is left out, for it moves no segment against others",)
     assert robot.notes == (left_out if suffix == ".urdf" else ())
 
@@ -95,9 +104,12 @@ def test_shapes_of_collisions_stand_in_where_none_are_visual(tmp_path: Path) -> 
         assert robot.mesh.names == ("base", "lid") and joint.turns and joint.moved == ("lid",)
         assert_allclose([joint.pivot, joint.axis], [[0, -0.1, 0.016], [1, 0, 0]], atol=1e-9)
         assert_allclose(joint.limits, (0.3, 2.2))
+        assert_allclose(robot.link_frames["lid"][:3, 3], [0, 0 if suffix == ".sdf" else -0.1, 0.016], atol=1e-12)
         low, high = robot.mesh.bounds
         assert_allclose([*low, *high[:2]], [-0.15, -0.1, -0.01, 0.15, 0.1], atol=1e-9)
         assert high[2] == pytest.approx(0.041, abs=1e-4)  # a round part that is joined to the lid
+        path.write_text(text.replace("0.015", "0.0005"))
+        assert all(examine(segment).sound for segment in read_robot(path).mesh.segments)  # however small
 
 
 BALL = "<collision><geometry><sphere radius='0.4'/></geometry></collision></link>"
@@ -166,6 +178,7 @@ def test_a_simulators_robot_has_its_joints_at_zero(tmp_path: Path) -> None:
     assert_allclose(joints["other"].limits, [0, 0.01])
     assert_allclose([joints["twist"].pivot, joints["twist"].axis], [[0.03, 0, 0.595], [0, 0, 1]], atol=1e-9)
     assert_allclose(joints["bend"].limits, [-0.5, 0.5])
+    assert_allclose(robot.link_frames["nail"], rigid(np.eye(3), np.array([0.03, 0, 0.595])), atol=1e-9)
     for old, new, message in (
         (
             '<joint name="finger"',
@@ -233,6 +246,19 @@ def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     assert "note: left and right overlap" in capsys.readouterr().out
 
 
+@pytest.mark.filterwarnings("ignore::mereo.io.mesh_formats.MeshWarning")
+def test_shells_of_a_link_that_overlap_are_no_fault_and_a_repair_unites_them(
+    working_folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    trimesh.util.concatenate([box((0.3, 0.2, 0.02)), box((0.1, 0.1, 0.05))]).export("base.stl")
+    Path("laptop.urdf").write_text(LAPTOP.replace('<box size="0.3 0.2 0.02"/>', '<mesh filename="base.stl"/>'))
+    run_mereo("scene", "new", "laptop.urdf")
+    assert run_mereo("scene", "check", "laptop.yaml") in (0, None)
+    assert "note: it intersects itself" in capsys.readouterr().out
+    run_mereo("scene", "check", "laptop.yaml", "--repair")
+    assert "repaired base: united 2 shells that overlap" in capsys.readouterr().out
+
+
 def test_joints_without_names_draw_as_before_and_names_are_checked(tmp_path: Path, gripper: Path) -> None:
     path = tmp_path / "gripper.yaml"
     run_mereo("scene", "new", gripper, "--output", path)
@@ -298,14 +324,51 @@ def test_a_robot_is_named_alone_and_an_sdf_file_has_one_model(gripper: Path, tmp
         mereo.load_object(path)
 
 
+@pytest.mark.skipif(not SALAMANDER.is_file(), reason="MEREO_ASSETS holds no lizard/salamander.sdf")
+def test_a_real_file_of_gazebo_loads_with_its_capsules_of_a_millimetre() -> None:
+    robot = read_robot(SALAMANDER)
+    assert len(robot.mesh.names) == 25 and len(robot.joints) == 30 and robot.notes == ()
+    assert all(examine(segment).sound for segment in robot.mesh.segments)
+    assert_allclose(np.ptp(robot.mesh.bounds, axis=0), [0.1003, 0.0324, 0.0081], atol=1e-4)
+    limits = {joint.name: joint.limits for joint in robot.joints}
+    assert_allclose([limits["joint_body_0"], limits["joint_leg_1_R_3"]], [[-pi / 2, pi / 2], [-pi, pi]], atol=1e-6)
+
+
+needs_arm = pytest.mark.skipif(not ARM.is_file(), reason="MEREO_ASSETS holds no robot/so101_new_calib.urdf")
+
+
+@needs_arm
+@pytest.mark.filterwarnings("ignore::mereo.io.mesh_formats.MeshWarning")
+def test_a_real_arm_loads_with_its_links_joints_and_limits(tmp_path: Path) -> None:
+    robot = read_robot(write_arm(tmp_path / "arm.urdf"))
+    links = ("base", "shoulder", "upper_arm", "lower_arm", "wrist", "gripper", "moving_jaw_so101_v1")
+    assert robot.mesh.names == tuple(f"{link}_link" for link in links) and robot.notes == ()
+    assert_allclose(np.ptp(robot.mesh.bounds, axis=0), [0.4295, 0.1109, 0.2681], atol=1e-4)
+    degrees = {joint.name: np.rad2deg(joint.limits).round().tolist() for joint in robot.joints}
+    assert degrees == {
+        "gripper": [-10, 100], "wrist_roll": [-157, 163], "wrist_flex": [-95, 95], "elbow_flex": [-97, 97],
+        "shoulder_lift": [-100, 100], "shoulder_pan": [-110, 110],
+    }  # fmt: skip
+    assert [len(joint.moved) for joint in robot.joints] == [1, 2, 3, 4, 5, 6]
+    run_mereo("scene", "new", tmp_path / "arm.urdf", "--output", tmp_path / "arm.yaml")
+    assert run_mereo("scene", "check", tmp_path / "arm.yaml") in (0, None)  # links of motors and brackets
+
+
 # --- frames -----------------------------------------------------------------------------------------------------------
+
+
+def assert_kinematics(path: Path, result: mereo.Result, link: str, base: str) -> None:
+    """Assert that the pose of a link in another one is what the file says of the values that were found."""
+    robot = yourdfpy.URDF.load(str(path), load_meshes=False)
+    robot.update_cfg({name: result.joints[name].value for name in robot.actuated_joint_names if name in result.joints})
+    assert_allclose(result[link].pose_in(base), robot.get_transform(link, base), atol=1e-6)
 
 
 def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "laptop.urdf").write_text(LAPTOP)
     laptop = mereo.load_object(tmp_path)  # the folder of a robot's file
     assert laptop.scene is not None
-    true = write_frame(tmp_path / "frame.ply", laptop.scene, 0.6, 0)
+    (true,) = write_frame(tmp_path / "frame.ply", laptop.scene, [0.6], 0)
     assert true == pytest.approx(0.3 + 0.6 * 1.9)  # the file's angle, although its rest pose is closed
     result = mereo.reconstruct(tmp_path / "frame.ply", laptop, unit_m=1.0)
     joint = result.joints["hinge"]
@@ -313,8 +376,9 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
     facts = FrameAnswer.of(result).facts  # what a line of a stream has
     assert facts["joints"] == {"hinge": joint.facts()}
     assert_allclose(facts["segments"]["lid"]["pose"], result["lid"].pose, atol=1e-6)
-    assert np.trace(result["lid"].pose_in("base")) == pytest.approx(2 + 2 * np.cos(joint.value), abs=1e-6)
-    assert pickle.loads(pickle.dumps(result)).joints == result.joints
+    assert_kinematics(tmp_path / "laptop.urdf", result, "lid", "base")
+    stored = pickle.loads(pickle.dumps(result))
+    assert stored.joints == result.joints
     assert joint.interval is not None and joint.interval[0] < true < joint.interval[1]
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
     assert_allclose(joint.limits, (0.3, 2.2))
@@ -324,11 +388,23 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
         assert len(re.findall(cells, page)) == 1, "as in the report, from which the last one is"
 
 
+@needs_arm
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::mereo.io.mesh_formats.MeshWarning")
+def test_the_joints_of_a_real_arm_are_within_a_degree(tmp_path: Path) -> None:
+    arm = mereo.load_object(write_arm(tmp_path / "arm.urdf"))
+    assert arm.scene is not None
+    true = write_frame(tmp_path / "frame.ply", arm.scene, default_rng(2).uniform(0.1, 0.9, 6).tolist(), 2, 192)
+    result = mereo.reconstruct(tmp_path / "frame.ply", arm, unit_m=1.0)
+    values = [joint.value for joint in result.joints.values()]
+    assert result.known is True and np.rad2deg(np.abs(np.subtract(values, true))).max() < 1.0
+
+
 def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     gripper: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.chdir(gripper.parent)
-    true = write_frame(Path("frame.ply"), scene_of_meshes([Path("gripper.urdf")]), 0.5, 2)
+    (true,) = write_frame(Path("frame.ply"), scene_of_meshes([Path("gripper.urdf")]), [0.5], 2)
     section = tmp_path / "section.md"
     section.write_text(PAGE.read_text().partition("## From a URDF or SDF")[2].partition("\n## ")[0])
     (commands,), (code,) = blocks(section, "bash"), blocks(section, "python")
@@ -347,6 +423,11 @@ def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
     result = variables["result"]
     assert isinstance(result, mereo.Result)
     assert result.joints["finger"].value == pytest.approx(facts["finger"]["value"], abs=1e-6)
+    assert_kinematics(Path("gripper.urdf"), result, "right", "palm")
+    assert_allclose(mereo.load_result("result")["right"].pose, result["right"].pose, atol=1e-6)
+    frame = load_scene("gripper.yaml").source_frame  # which the page's command has written
+    assert_allclose(SourceFrame.of_facts(frame.facts()).link_frames["right"][:3, 3], [0.01, 0, 0.047])
+    assert scene_of_meshes([Path("../meshes/palm.stl")]).link_frames == {}
     assert isinstance(held := variables["held"], mereo.Result) and held.known is True
     assert held.joints["finger"].interval == pytest.approx((true, true), abs=1e-12)
 
@@ -356,7 +437,7 @@ def test_each_frame_of_a_stream_has_the_joints_of_its_moment(
 ) -> None:
     Path("frames").mkdir()
     scene = scene_of_meshes([gripper])
-    true = [write_frame(Path(f"frames/{i}.ply"), scene, 0.4 + 0.03 * i, 5) for i in range(6)]
+    true = [write_frame(Path(f"frames/{i}.ply"), scene, [0.4 + 0.03 * i], 5)[0] for i in range(6)]
     run_mereo("stream", "frames", "--object", gripper, "--unit-m", "1", "--every-frame")
     lines = [*map(json.loads, capsys.readouterr().out.splitlines())]
     assert [line["tracking"] for line in lines] == ["found", *["followed"] * 5]
@@ -408,7 +489,16 @@ def test_known_values_narrow_the_random_states_whoever_states_them(known: mereo.
     assert given_shares(known, {"finger": within}) == pytest.approx((0.0, 0.01 / 0.032))
     both = {"finger": within, "other finger": {"value": 0.006, "within": 0.001}}
     assert given_shares(known, both) == pytest.approx((0.003 / 0.032, 0.007 / 0.032))
-    assert known.with_joints({"finger": 0.02}) is known.with_joints(state)  # made once
+    assert (fixed := known.with_joints({"finger": 0.02})) is known.with_joints(state)  # made once
+    assert fixed.model is not None and not are_near(fixed.model)
+
+
+def test_an_angle_beyond_limits_is_named_as_it_was_given_and_links_are_rigid(tmp_path: Path) -> None:
+    (tmp_path / "laptop.urdf").write_text(LAPTOP)
+    laptop = mereo.load_object(tmp_path / "laptop.urdf", deformations="rigid")  # with a joint all the same
+    sentence = "joint 'hinge' is 86; its limits are 0.3 to 2.2 rad: give radians, correct it, or add `within`"
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        laptop.with_joints({"hinge": 86})
 
 
 def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> None:
@@ -423,7 +513,9 @@ def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> No
 
 NO_JOINTS = {
     "no joint is called 'fingr'; it must be one of other finger, finger: correct it": {"fingr": 0.02},
-    "joint 'finger' is 0.05; its limits are 0.003 to 0.035 m: correct it, or add `within`": {"finger": 0.05},
+    "joint 'finger' is 0.05; its limits are 0.003 to 0.035 m: give metres, correct it, or add `within`": {
+        "finger": 0.05
+    },
     "joint 'finger' is 'open'; it must be a finite number: give for example 0.1": {"finger": "open"},
     "joint 'finger' is nan; it must be a finite number": {"finger": float("nan")},
     "joint 'finger' is True; it must be a finite number": {"finger": True},
@@ -487,7 +579,7 @@ def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
     capsys: pytest.CaptureFixture,
 ) -> None:
     assert known.scene is not None
-    true = write_frame(Path("frame.ply"), known.scene, 0.4, 5)
+    (true,) = write_frame(Path("frame.ply"), known.scene, [0.4], 5)
     free, fixed = (mereo.reconstruct("frame.ply", known, unit_m=1.0, joints=j) for j in (None, {"finger": true}))
     joints = fixed.joints
     assert joints["finger"].value == pytest.approx(true, abs=1e-12) and fixed.known is True
@@ -508,6 +600,6 @@ def test_only_the_rest_of_a_gripper_with_known_joints_is_looked_for(
 @pytest.mark.slow  # as nothing explains the frame, the search tries all it has
 def test_a_frame_that_contradicts_a_known_value_is_not_believed(known: mereo.Object, tmp_path: Path) -> None:
     assert known.scene is not None
-    true = write_frame(tmp_path / "frame.ply", known.scene, 0.4, 5)
+    (true,) = write_frame(tmp_path / "frame.ply", known.scene, [0.4], 5)
     result = mereo.reconstruct(tmp_path / "frame.ply", known, unit_m=1.0, joints={"finger": true + 0.01})
     assert result.known is False and result.joints["finger"].value == pytest.approx(true + 0.01, abs=1e-12)

@@ -28,6 +28,7 @@ from mereo.synthesis.depth_sensor import add_depth_noise, render_depth
 
 PACKAGE = Path(__file__).parents[2] / "examples/ros2/mereo_ros"
 DEFINITIONS = get_typestore(Stores.ROS2_HUMBLE).fielddefs
+PARTS = "exceptions", "executors", "node", "qos"
 ZEROS = {"float32": 0.0, "float64": 0.0, "bool": False, "string": "", "byte": b"\0"}
 
 
@@ -73,7 +74,10 @@ class Node:
 
     def declare_parameter(self, name: str, value: Any, descriptor: Any) -> None:
         assert type(descriptor) is message("rcl_interfaces/msg/ParameterDescriptor") and descriptor.description
-        self.values[name] = SimpleNamespace(value=self.stated.get(name, value))
+        stated = self.stated.get(name, value)
+        if type(stated) is not type(value) and not descriptor.dynamic_typing:
+            raise LookupError(f"{name} is of another type")  # in the place of ParameterException
+        self.values[name] = SimpleNamespace(value=stated)
 
     def get_parameter(self, name: str) -> Any:
         return self.values[name]
@@ -85,9 +89,9 @@ class Node:
 @pytest.fixture(scope="module")
 def ros() -> Iterator[Any]:
     """Module of the node, among stand-ins of the modules that it imports."""
-    tools = MagicMock(Node=Node, QoSProfile=dict)
+    tools = MagicMock(Node=Node, QoSProfile=dict, ParameterException=LookupError)
     tools.TransformBroadcaster = lambda node: SimpleNamespace(sendTransform=node.sent.extend)
-    modules = dict.fromkeys(("rclpy", "rclpy.executors", "rclpy.node", "rclpy.qos", "tf2_ros"), tools)
+    modules = dict.fromkeys(("rclpy", *(f"rclpy.{part}" for part in PARTS), "tf2_ros"), tools)
     for name in DEFINITIONS:
         package, _, kind = name.split("/")
         setattr(modules.setdefault(f"{package}.msg", SimpleNamespace()), kind, message(name))
@@ -142,7 +146,7 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = write_gripper(tmp_path)
-    monkeypatch.setattr(Node, "stated", {"object": [str(robot)]})
+    monkeypatch.setattr(Node, "stated", {"object": str(robot)})  # or a list
     T = rigid(Rotation.from_euler("xyz", [195, 30, 200], degrees=True).as_matrix(), np.array([0.0, 0.0, 0.45]))
     parts = zip(read_robot(robot).mesh.segments, (0.0, -0.02, 0.012), strict=True)  # the fingers are so far open
     moved = [SegmentedMesh((part,)).transformed(T @ rigid(np.eye(3), np.array([x, 0, 0]))) for part, x in parts]
@@ -154,6 +158,8 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     assert all(each.header.stamp is frame.header.stamp for each in node.sent if "header" in vars(each))
     sent = taken(node)
     assert_allclose(sent["object/palm"], T, atol=0.01)
+    right = T @ rigid(np.eye(3), np.array([0.012, 0, 0])) @ read_robot(robot).link_frames["right"]
+    assert_allclose(sent["object/right"], right, atol=0.01)
     joints = dict(zip(sent["JointState"].name, sent["JointState"].position, strict=True))
     assert joints == pytest.approx({"finger": 0.02, "other finger": 0.012}, abs=0.001)
     for marker, part in zip(sent["MarkerArray"].markers, mesh.segments, strict=True):
@@ -222,9 +228,14 @@ def test_the_package_has_what_ros2_run_and_launch_need(ros: Any, node: Any, monk
     monkeypatch.chdir(PACKAGE)
     parameters = yaml.safe_load(Path("config/mereo.yaml").read_text())["/**"]["ros__parameters"]
     assert set(parameters) == set(ros.PARAMETERS)
-    monkeypatch.setattr(Node, "stated", {"input": "cloud"})
-    with pytest.raises(SystemExit, match="^mereo_ros: error: the input is 'cloud'; it must be depth or points"):
-        ros.main()
+    for stated, words in (
+        ({"input": "cloud"}, "the input is 'cloud'; it must be depth or points"),
+        ({"object": 5}, "the object is 5; it must be the name of a file, or a list of such"),
+        ({"silent_s": 2}, "silent_s is of another type"),
+    ):
+        monkeypatch.setattr(Node, "stated", stated)
+        with pytest.raises(SystemExit, match=f"^mereo_ros: error: {words}"):
+            ros.main()
     tools = MagicMock()
     names = "launch", "launch.actions", "launch.substitutions", "launch_ros.actions", "ament_index_python.packages"
     for name in ("setuptools", *names):

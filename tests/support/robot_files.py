@@ -1,6 +1,8 @@
-"""Robots as files: a gripper whose second finger mimics the first, as URDF and as SDF, and a laptop."""
+"""Robots as files: a gripper whose second finger mimics the first, as URDF and as SDF, a laptop, and a real arm."""
 
+import os
 from pathlib import Path
+from xml.etree import ElementTree
 
 from trimesh.creation import box
 
@@ -94,6 +96,30 @@ LAPTOP_SDF = """\
   </joint>
 </model></world></sdf>
 """
+
+
+ASSETS = Path(os.environ.get("MEREO_ASSETS", "/absent"))
+"""Folder of files that are not in the repository."""
+
+SALAMANDER = ASSETS / "lizard/salamander.sdf"
+"""Of Pazzaglia's simulations, MIT licence: legs of spheres and of capsules with a radius of a millimetre."""
+
+ARM = ASSETS / "robot/so101_new_calib.urdf"
+"""The SO-101, Apache 2.0 licence; its meshes are united to one for each link, in the link's frame."""
+
+
+def write_arm(path: Path) -> Path:
+    """Write the real arm's file, with the meshes of its links that are next to it as their only shapes."""
+    tree = ElementTree.parse(ARM)
+    for link in tree.iter("link"):
+        for shape in [*link.findall("visual"), *link.findall("collision")]:
+            link.remove(shape)
+        mesh = ARM.with_name(f"so101_{link.get('name')}.obj")
+        if mesh.is_file():
+            geometry = ElementTree.SubElement(ElementTree.SubElement(link, "visual"), "geometry")
+            ElementTree.SubElement(geometry, "mesh", filename=str(mesh))
+    tree.write(path)
+    return path
 
 
 def write_gripper(folder: Path) -> Path:

@@ -46,7 +46,7 @@ from mereo.io.writers.formats import WRITERS, chosen_formats
 from mereo.io.writers.volumes import MM_PER_M
 from mereo.reconstruction.pipeline import Reconstruction, described
 from mereo.results.carry import carry, place
-from mereo.results.joints import JointValues, measure_joints, pose_covariance
+from mereo.results.joints import JointValues, measure_joints, pose_covariance, segment_poses
 from mereo.visualization.reconstruction_report import result_html, stated_joints
 from mereo.visualization.result_files import (
     INSTANCE,
@@ -88,7 +88,8 @@ class SegmentResult:
             without a network.
         error_radius: radius around the centroid that holds the true one with probability 0.95; None where the answer
             is the network's.
-        pose: best rigid motion from the object's own files to the frame, as ``Result.pose``; None likewise.
+        pose: best rigid motion from the object's own files to the frame, as ``Result.pose``; of a link of a robot's
+            file, the pose of its frame there; None likewise.
         poses: of all segments, by their names; empty where the answer is the network's.
     """
 
@@ -103,11 +104,11 @@ class SegmentResult:
     poses: Mapping[str, Pose] = field(default_factory=dict)
 
     def pose_in(self, name: str) -> Pose:
-        """Pose of this segment in the frame of another one: its motion, seen by that one, from where it was at rest.
+        """Pose of this segment in the frame of another one.
 
-        4 x 4, ``T_other_this``, in the frame's unit: both have the axes and the origin of the object's own files, so
-        that it is the unit matrix at rest. Raises ``KeyError`` for a name of no segment, and ``ValueError`` where the
-        answer is the network's, which has no poses.
+        4 x 4, ``T_other_this``, in the frame's unit. Links of a robot's file have their frames there; other segments
+        have the axes and the origin of the object's own files, so that it is the unit matrix at rest. Raises
+        ``KeyError`` for a name of no segment, and ``ValueError`` where the answer is the network's, which has no poses.
         """
         if self.pose is None:
             raise ValueError(NO_REGISTRATION)
@@ -317,8 +318,7 @@ class Result(Answer, SegmentedResult):
         fit, parts = self.registered, self.reconstruction.segments
         sure = None if fit is None else fit.uncertainty
         radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
-        poses = {} if fit is None else {part.name: fit.segment_pose(part.label) for part in parts}
-        return _segment_results(parts, self.surfaces, radii, poses)
+        return _segment_results(parts, self.surfaces, radii, {} if fit is None else segment_poses(fit))
 
     def to_dict(self) -> JsonObject:
         """Figures as in ``summary.json``, in plain types: numbers, texts, lists, None for NaN.

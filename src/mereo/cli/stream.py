@@ -50,7 +50,7 @@ from mereo.locating.whole_frame import at_point
 from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
-from mereo.results.joints import measure_joints
+from mereo.results.joints import measure_joints, segment_poses
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
 STANDARD_INPUT = "-"
@@ -497,8 +497,9 @@ class FrameAnswer:
         facts |= {"method": registered.method, "located_by": answer.located_by}
         facts |= {"pose": _rows(registered.pose()), "joints": joints}
         figures = zip(mesh.names, owned_centroids(mesh), mesh.owned_volumes, strict=True)
-        for label, (name, centroid, volume) in enumerate(figures, start=1):
-            segments[name] = {**_facts(centroid, float(volume)), "pose": _rows(registered.segment_pose(label))}
+        poses = segment_poses(registered)
+        for name, centroid, volume in figures:
+            segments[name] = {**_facts(centroid, float(volume)), "pose": _rows(poses[name])}
         if (radius or uncertainty) and (sure := registered.uncertainty) is not None:
             facts["radius95"] = sure.summary(sure.outline)
             for each in sure.segments if uncertainty else ():

@@ -38,6 +38,9 @@ MOST_BURIED, MOST_BACKWARDS, MOST_UNDECIDED = 5e-3, 0.05, 0.5
 inwards before the winding number has no meaning, and have as much inside before as behind: of open ones it is all."""
 
 
+CROSSED = "intersects itself"
+"""Beginning of the fault of a mesh of which some surface lies within it, as where shells overlap."""
+
 MOST_DIRTY = 300_000
 """Faces of a mesh that is no solid: the winding number takes as long for every place that is asked for."""
 
@@ -115,7 +118,7 @@ def examine(segment: Segment, unit: str = "") -> Health:
         buried |= surface.winding < -1.5  # inside out, what lies within the mesh has twice the winding number before it
     if surface.share_where(buried) > MOST_BURIED:
         share = f"{surface.share_where(buried):.1%} of its surface lies within it"
-        dirty.append(f"intersects itself ({share}, {surface.place(buried, unit)})")
+        dirty.append(f"{CROSSED} ({share}, {surface.place(buried, unit)})")
     notes = _notes(vertices, faces, surface, unit)
     if 1e-5 < turned <= MOST_BACKWARDS:
         notes += (f"has {100 * turned:.2g} % of its surface facing inwards, {surface.place(backwards, unit)}",)

@@ -43,6 +43,9 @@ Matrices = Float[ndarray, "n 3 3"]
 Transform = Float[ndarray, "4 4"]
 """Homogeneous matrix of a map between two frames."""
 
+NamedPoses = dict[str, Transform]
+"""Poses by the names of segments or links."""
+
 Corners = Float[ndarray, "2 3"]
 """Lower and upper corner of a box along the axes."""
 

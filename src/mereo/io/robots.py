@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from mereo.geometry.conventions import LARGEST, Names, Range, Texts
 from mereo.geometry.mesh import PALETTE, AnyMesh, Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import united
-from mereo.geometry.transforms import Transform, Vector, inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import NamedPoses, Transform, Vector, inverse_rigid, rigid, transform_points
 from mereo.io.config import RobotMeshes
 from mereo.io.errors import AnyPath, readable
 from mereo.io.extras import library
@@ -69,11 +69,13 @@ class Robot:
     Attributes:
         mesh: a segment for each link that moves, with all links fixed to it, called after the first of them that has a
             shape; where all joints are zero.
+        link_frames: pose in the base of the link that a segment is called after, there too.
         joints: those that move some of the segments against others, the tip of each chain first.
         notes: sentences about joints that are left out, and about links without shapes of the kind that is taken.
     """
 
     mesh: SegmentedMesh
+    link_frames: NamedPoses
     joints: tuple[RobotJoint, ...]
     notes: Names
 
@@ -122,8 +124,9 @@ def read_robot(path: AnyPath, robot_meshes: RobotMeshes = "visual") -> Robot:
             return _assembled(_read_mjcf(path, yourdfpy, library("mujoco", "simulation", path), robot_meshes))
         if kind == "URDF":
             described = _read_urdf(yourdfpy, root, etree.tostring(root, encoding="utf-8"))
+            link_frames = NamedPoses()
         else:
-            described = _read_sdf(yourdfpy, root)
+            described, link_frames = _read_sdf(yourdfpy, root)
         for link in described.links if robot_meshes == "collision" else ():
             link.visuals, link.collisions = link.collisions, link.visuals
         for joint in described.joints:
@@ -140,7 +143,7 @@ def read_robot(path: AnyPath, robot_meshes: RobotMeshes = "visual") -> Robot:
         else:
             shapes.append(_Shape(link, _origin(each), solid))
     known = tuple((name, state.st_ino, state.st_size, state.st_mtime_ns) for name, state in states)
-    return _assembled(_Described(path, described, shapes, known, robot_meshes))
+    return _assembled(_Described(path, described, link_frames, shapes, known, robot_meshes))
 
 
 def _solid(geometry: Any) -> trimesh.Trimesh | None:
@@ -167,8 +170,11 @@ def _read_urdf(yourdfpy: Any, root: Any, content: bytes) -> Any:
     return yourdfpy.URDF.load(BytesIO(content), build_scene_graph=False, load_meshes=False).robot
 
 
-def _read_sdf(yourdfpy: Any, root: Any) -> Any:
-    """Robot of an SDF file's only model, as yourdfpy would have it from a URDF file: links in the frames of joints."""
+def _read_sdf(yourdfpy: Any, root: Any) -> tuple[Any, NamedPoses]:
+    """Robot of an SDF file's only model, as yourdfpy would have it from a URDF file: links in the frames of joints.
+
+    With it come the poses of the links' own frames in those.
+    """
     models = [*root.iterfind("model"), *root.iterfind("world/model")]
     if len(models) != 1 or models[0].find("include") is not None or models[0].find("model") is not None:
         raise ValueError(f"it has {len(models)} models; it must have one, without others in it")
@@ -213,7 +219,8 @@ def _read_sdf(yourdfpy: Any, root: Any) -> Any:
                 place = inverse_rigid(frames[link.name]) @ pose(each, link.name)
                 shapes.append(yourdfpy.Visual(None, place, _geometry(yourdfpy, each)))
         links.append(link)
-    return yourdfpy.Robot(model.get("name"), links, joints)
+    link_frames = {name: inverse_rigid(frame) @ pose_of(name) for name, frame in frames.items()}
+    return yourdfpy.Robot(model.get("name"), links, joints), link_frames
 
 
 def _with_axis(yourdfpy: Any, joint: Any, axis: Any, pose_of: Any) -> Any:
@@ -253,7 +260,7 @@ def _geometry(yourdfpy: Any, element: Any) -> Any:
         return trimesh.creation.icosphere(3, _number(shape, "radius", ""))
     if shape.tag in ("cylinder", "capsule"):
         radius, length = (_number(shape, key, "") for key in ("radius", "length"))
-        return getattr(trimesh.creation, shape.tag)(radius=radius, height=length)
+        return trimesh.creation.cylinder(radius, length) if shape.tag == "cylinder" else _capsule(radius, length)
     raise ValueError(f"its <{element.tag}> {element.get('name')!r} is a {shape.tag}, which is not known")
 
 
@@ -297,8 +304,10 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
             joint.parent, joint.child, joint.origin = carrier, frame, rigid(np.eye(3), at - place[carrier])
             place[frame], carrier = at, frame
             joints.append(joint)
-    shapes = list[_Shape]()
+    shapes, link_frames = list[_Shape](), NamedPoses()
     for body in range(1, model.nbody):
+        at = data.xpos[body] - place[names[body]]
+        link_frames[names[body]] = rigid(data.xmat[body].reshape(3, 3), at)
         geoms = np.arange(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
         collides = (model.geom_contype[geoms] != 0) | (model.geom_conaffinity[geoms] != 0)
         is_taken = collides == (robot_meshes == "collision")
@@ -309,7 +318,7 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
     mujoco.mj_saveModel(model, None, compiled)
     robot = yourdfpy.Robot(path.stem, list(links.values()), joints)
     states = ((str(path), crc32(compiled.tobytes()), len(compiled), 0),)
-    return _Described(path, robot, shapes, states, robot_meshes)
+    return _Described(path, robot, link_frames, shapes, states, robot_meshes)
 
 
 def _mjcf_mimic(model: Any, mujoco: Any, yourdfpy: Any, number: int) -> Any:
@@ -335,10 +344,15 @@ def _mjcf_solids(model: Any, mujoco: Any, geom: int) -> Iterator[trimesh.Trimesh
     elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
         yield trimesh.creation.cylinder(x, 2 * y)
     elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        yield trimesh.creation.capsule(2 * y, x)
+        yield _capsule(x, 2 * y)
     elif kind in (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
         ball = trimesh.creation.icosphere(3)
         yield trimesh.Trimesh(ball.vertices * ([x, y, z] if y else x), ball.faces, process=False)
+
+
+def _capsule(radius: float, length: float) -> trimesh.Trimesh:
+    """Capsule, made with the radius 1: the library joins points that are nearer than 10 nm, as those of small ones."""
+    return trimesh.creation.capsule(length / radius, 1.0).apply_scale(radius)
 
 
 def _numbers(text: str | None, count: int) -> list[float]:
@@ -390,10 +404,14 @@ class _Shape(NamedTuple):
 
 @dataclass(frozen=True)
 class _Described:
-    """Content of a file: yourdfpy's robot and its shapes; equal where ``states`` of files and ``robot_meshes`` are."""
+    """Content of a file: yourdfpy's robot and its shapes; equal where ``states`` of files and ``robot_meshes`` are.
+
+    ``link_frames`` are those of the file, in the robot's, where they are not the same.
+    """
 
     path: Path = field(compare=False)
     robot: Any = field(compare=False)
+    link_frames: NamedPoses = field(compare=False)
     shapes: list[_Shape] = field(compare=False)
     states: tuple[tuple[str, int, int, int], ...]
     robot_meshes: RobotMeshes
@@ -434,7 +452,8 @@ def _assembled(content: _Described) -> Robot:
             place = joint.type != "prismatic", poses[joint.child][:3, 3], axis, (ends[0], ends[1])
             _check_numbers(path, joint.name, np.array([*poses[joint.child][:3, 3], *axis, *np.rad2deg(ends)]))
             joined.append(RobotJoint(joint.name, *place, kept[joint.name], leader if leader in kept else ""))
-    return Robot(SegmentedMesh(tuple(segments)), tuple(joined), tuple(sorted(notes)))
+    frames = {name: poses[name] @ content.link_frames.get(name, np.eye(4)) for name in parts}
+    return Robot(SegmentedMesh(tuple(segments)), frames, tuple(joined), tuple(sorted(notes)))
 
 
 def _check_numbers(path: Path, name: str, values: ndarray) -> None:

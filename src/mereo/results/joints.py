@@ -26,7 +26,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, WITHIN
 from mereo.geometry.brief import as_exact_as
 from mereo.geometry.conventions import Range
-from mereo.geometry.transforms import Indices, fit_rigid, transform_points
+from mereo.geometry.transforms import Indices, NamedPoses, fit_rigid, transform_points
 from mereo.io.atomic_files import JsonObject
 from mereo.scenes.scene import AssetUnavailable, Scene
 
@@ -156,6 +156,16 @@ def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Fl
         return None
     gaussian, ways = moves
     return np.abs(ways).max(axis=1, initial=0.0) + WITHIN * norm(gaussian, axis=1)
+
+
+def segment_poses(registration: Registration) -> NamedPoses:
+    """Poses of all segments in the frame: of the links' frames of a robot's file, else of the origin of the files."""
+    source, poses = registration.model.source_frame, NamedPoses()
+    for label, name in enumerate(registration.model.rest.names, start=1):
+        rest = np.eye(4) if source is None else source.link_frames.get(name, np.eye(4)).copy()
+        rest[:3, 3] *= registration.model_scale
+        poses[name] = registration.segment_pose(label) @ rest
+    return poses
 
 
 def pose_covariance(registration: Registration) -> Float[ndarray, "6 6"] | None:

@@ -412,6 +412,7 @@ def _values(given: Any, names: list[str]) -> dict[str, Range]:
 
 def _shares(joint: JointSampler, value: float, within: float, unit_m: float) -> Range:
     """Least and greatest share of a joint's range by its value in radians or metres."""
+    stated = value
     unit, turn, name = (1.0, 2 * pi, "rad") if joint.turns else (unit_m, np.inf, "m")
     first, second = (unit * limit for limit in joint.limits)
     if joint.turns:  # a whole turn more is the same state
@@ -421,7 +422,8 @@ def _shares(joint: JointSampler, value: float, within: float, unit_m: float) -> 
         return low, high
     if low > 1 + ROUNDING or high < -ROUNDING:
         least, most = sorted((first, second))
-        limits = f"{least:.6g} to {most:.6g} {name}"
-        raise ValueError(f"joint {joint.name!r} is {value:.6g}; its limits are {limits}: correct it, or add `within`")
+        limits, words = f"{least:.6g} to {most:.6g} {name}", "radians" if joint.turns else "metres"
+        text = f"joint {joint.name!r} is {stated:.6g}; its limits are {limits}: "
+        raise ValueError(f"{text}give {words}, correct it, or add `within`")
     least, most = np.clip([low, high], 0.0, 1.0).tolist()
     return least, most

@@ -305,6 +305,8 @@ def model_key(scene: Scene, count: int) -> str:
     digest = hashlib.sha256(f"{VERSION} {count} {STATES_SEED} {NODES} {scene.unit_m} {scene.rest.nested}".encode())
     digest.update((scene.space or "").encode())
     digest.update(np.ascontiguousarray(scene.T_scene_source).tobytes())
+    for name, frame in scene.link_frames.items():
+        digest.update(name.encode() + np.ascontiguousarray(frame).tobytes())
     for segment in drawn.rest.segments:
         digest.update(f"{segment.name} {segment.color} {segment.solid} {segment.faces.shape}".encode())
         digest.update(np.ascontiguousarray(segment.faces, np.int64).tobytes())

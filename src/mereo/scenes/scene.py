@@ -13,7 +13,7 @@ from mereo.deformation.maps import Deformations
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.conventions import Facts, Range, Triple, WorkspaceName
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import Transform, Vector, look_at, rotation_along
+from mereo.geometry.transforms import NamedPoses, Transform, Vector, look_at, rotation_along
 from mereo.io.atomic_files import JsonObject
 from mereo.io.config import Space
 from mereo.scenes.seeds import TEST_SEED_START
@@ -23,12 +23,14 @@ from mereo.scenes.seeds import TEST_SEED_START
 class SourceFrame:
     """Similarity from the frame of an object's own files, and metres per scene unit, None where they are not known.
 
-    ``space`` is the anatomical frame that the files name, if any.
+    ``space`` is the anatomical frame that the files name, if any; ``link_frames`` are the poses at rest of the frames
+    that a robot's file gives its links, in the files' frame and unit, by the names of the segments.
     """
 
     T_scene_source: Transform
     unit_m: float | None
     space: Space | None = None
+    link_frames: NamedPoses = field(default_factory=NamedPoses)
 
     @property
     def scale(self) -> float:
@@ -37,14 +39,17 @@ class SourceFrame:
 
     def facts(self) -> JsonObject:
         """Plain values for a file's header."""
-        return {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m, "space": self.space}
+        links = {name: frame.tolist() for name, frame in self.link_frames.items()}
+        known = {"T_scene_source": self.T_scene_source.tolist(), "unit_m": self.unit_m, "space": self.space}
+        return {**known, **({"link_frames": links} if links else {})}
 
     @classmethod
     def of_facts(cls, facts: Facts | None) -> "SourceFrame | None":
         """Inverse of ``facts``; None for files from before it was known."""
         if facts is None:
             return None
-        return cls(np.asarray(facts["T_scene_source"], float), facts["unit_m"], facts.get("space"))
+        links = {name: np.asarray(frame, float) for name, frame in facts.get("link_frames", {}).items()}
+        return cls(np.asarray(facts["T_scene_source"], float), facts["unit_m"], facts.get("space"), links)
 
 
 GUESSED_UNIT_M = 0.01
@@ -134,6 +139,7 @@ class Scene:
         T_scene_source: similarity from the frame and unit of the files that the object was read from to the scene's;
             the identity where it is defined in scene units.
         space: anatomical frame of those files, where they name one.
+        link_frames: as of ``SourceFrame``; empty where those are no robot's.
         definition: what a scene from a file states, in a text that changes exactly when its meaning does. Empty for
             built-in scenes: the version of mereo stands for it.
         file: scene file that it was read from, as it was named; None for others.
@@ -151,6 +157,7 @@ class Scene:
     cone: Workspace | None = None
     file: Path | None = None
     space: Space | None = None
+    link_frames: NamedPoses = field(default_factory=NamedPoses)
 
     def __post_init__(self) -> None:
         if self.held_out is not None and self.held_out.rest.names != self.rest.names:
@@ -167,7 +174,7 @@ class Scene:
     @property
     def source_frame(self) -> SourceFrame:
         """Frame of the object's own files."""
-        return SourceFrame(self.T_scene_source, self.unit_m, self.space)
+        return SourceFrame(self.T_scene_source, self.unit_m, self.space, self.link_frames)
 
     def workspace_named(self, name: WorkspaceName) -> Workspace:
         """Workspace of the scene by name, at its own distances and with its own angle of view.

@@ -22,7 +22,7 @@ from mereo.io.sensor_frame import SensorFrame
 from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.results.carry import Carried
-from mereo.results.joints import measure_joints, pose_covariance
+from mereo.results.joints import measure_joints, pose_covariance, segment_poses
 from mereo.results.state import write_state
 from mereo.scenes.rest_pose import rest_digest
 from mereo.visualization.previews import render_cloud_and_segments
@@ -69,8 +69,9 @@ def summary_of(
     if answer.is_missing:
         return {**head, "pose": None, "segments": [], "tracking": answer.tracking, **facts}
     result, fit = answer.reconstruction, answer.registered
+    poses = {} if fit is None else segment_poses(fit)
     segments = [
-        {**asdict(segment), **({} if fit is None else {"pose": fit.segment_pose(segment.label)}), "color": color}
+        {**asdict(segment), **({} if fit is None else {"pose": poses[segment.name]}), "color": color}
         for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
     radii, sure = JsonObject(), None if fit is None else fit.uncertainty

@@ -16,6 +16,7 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -50,11 +51,18 @@ class ObjectTracker(Node):
     def __init__(self) -> None:
         super().__init__("mereo")
         for name, (default, text) in PARAMETERS.items():
-            self.declare_parameter(name, default, ParameterDescriptor(description=text, read_only=True))
+            any_type = name == "object"  # one file need not be a list
+            descriptor = ParameterDescriptor(description=text, read_only=True, dynamic_typing=any_type)
+            self.declare_parameter(name, default, descriptor)
         stated = {name: self.get_parameter(name).value for name in PARAMETERS}
         if stated["input"] not in ("depth", "points"):
             raise ValueError(f"the input is {stated['input']!r}; it must be depth or points: correct the parameter")
-        files = [file for file in stated["object"] if file]
+        named = stated["object"]
+        if not isinstance(named, str | list):
+            raise ValueError(
+                f"the object is {named!r}; it must be the name of a file, or a list of such: correct the parameter"
+            )
+        files = [file for file in ([named] if isinstance(named, str) else named) if file]
         self.tracker = mereo.Tracker(
             mereo.load_object(
                 files[0] if len(files) == 1 else files or None,
@@ -164,7 +172,7 @@ def main(args: list[str] | None = None) -> None:
     rclpy.init(args=args)
     try:
         node = ObjectTracker()
-    except (ValueError, OSError, ImportError) as error:
+    except (ValueError, OSError, ImportError, ParameterException) as error:
         rclpy.try_shutdown()
         raise SystemExit(f"mereo_ros: error: {error}") from None
     try:

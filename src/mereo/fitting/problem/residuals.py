@@ -348,7 +348,7 @@ class Prior:
             return cls.whole(model)
         distance = (((model.library - z) * model.motion) ** 2).sum(axis=1)
         near = model.library[np.argsort(distance)[skipped : 50 + skipped]].astype(np.float64)
-        center = near.mean(axis=0)
+        center = near.sum(axis=0) / max(1, len(near))  # there may be none
         covariance = (near - center).T @ (near - center) / max(1, len(near) - 1)
         return cls(center, np.linalg.inv(covariance + 0.17**2 * np.eye(model.count)))
 

@@ -23,10 +23,10 @@ from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
-from mereo.geometry.transforms import Normalizer, longest_side
+from mereo.geometry.transforms import NamedPoses, Normalizer, longest_side
 from mereo.io.config import RobotMeshes, Space
 from mereo.io.mesh_formats import MeshWarning
-from mereo.io.robots import read_object_file
+from mereo.io.robots import is_robot, read_object_file, read_robot
 from mereo.io.simulation_states import files_of_states, frame_files
 from mereo.io.volume_files import file_space, read_label_volume, segment_surfaces
 from mereo.io.yaml_document import Document, similar
@@ -145,7 +145,12 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
         rest = _kept(refined, _Keyed(key, (rest, motions)))
         scene = Scene(file.name, rest, replace(motions, rest=rest), workspace, file.source)
     return replace(
-        scene, unit_m=unit_m, T_scene_source=placement.matrix, definition=definition, space=_space(document, file)
+        scene,
+        unit_m=unit_m,
+        T_scene_source=placement.matrix,
+        definition=definition,
+        space=_space(document, file),
+        link_frames=_link_frames(document, file),
     )
 
 
@@ -159,6 +164,17 @@ def _space(document: Document, file: SceneFile) -> Space | None:
             "one frame: export them in one space"
         )
     return next(iter(spaces), None)
+
+
+def _link_frames(document: Document, file: SceneFile) -> NamedPoses:
+    """Frames of the links of a robot's file, by the segments: that of the first link of each; else none."""
+    path = document.path.parent / (file.model or "")
+    if file.model is None or not is_robot(path):
+        return NamedPoses()
+    frames = read_robot(path, file.robot_meshes).link_frames
+    if file.parts is None:
+        return frames
+    return {part.name: frames[(part.parts or [part.name])[0]] for part in file.parts}
 
 
 # --- what takes most of the time of loading a scene, which one command does several times ----------------------------

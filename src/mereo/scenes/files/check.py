@@ -14,7 +14,17 @@ from mereo.geometry.brief import counted
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import UNITS_M, Texts
 from mereo.geometry.mesh import Segment, SegmentedMesh
-from mereo.geometry.mesh_check import PLAUSIBLE_M, Health, Overlap, examine, grid_volume, likely_unit, near, overlaps
+from mereo.geometry.mesh_check import (
+    CROSSED,
+    PLAUSIBLE_M,
+    Health,
+    Overlap,
+    examine,
+    grid_volume,
+    likely_unit,
+    near,
+    overlaps,
+)
 from mereo.geometry.mesh_repair import farthest, repaired, without_overlaps
 from mereo.geometry.solids import Solids
 from mereo.geometry.symmetry import TOLERANCE, describe_symmetries, find_symmetries
@@ -55,7 +65,7 @@ def check_scene(name: str, repair: bool = False) -> None:
         if not PLAUSIBLE_M[0] <= longest_m <= PLAUSIBLE_M[1]:
             guess = likely_unit(mesh.bounds)
             print(f"  note: that is unlikely for a depth camera's object; the unit may be {guess}")
-        if faults and repair:
+        if repair and not (faults == 0 and all(condition.sound for condition in health)):
             _check_repaired(document, mesh, health, unit, is_mechanism)
             return
         if repair:
@@ -88,15 +98,20 @@ def _is_mechanism(scene: Scene) -> bool:
 
 
 def _report(mesh: SegmentedMesh, health: list[Health], unit: str, is_mechanism: bool = False) -> int:
-    """Print each segment and each overlap, which is no fault of a mechanism; returns the number of faults."""
+    """Print each segment and each overlap; returns the number of faults.
+
+    Overlaps are none of a mechanism, whose links are often made of shells that overlap, too, such as a motor's.
+    """
     faults, usable = 0, not any(condition.hopeless for condition in health)
     volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
     for segment, condition, volume in zip(mesh.segments, health, volumes, strict=True):
         inside = volume if condition.sound or condition.hopeless else grid_volume(replace(segment, solid=False))
         amount = f"   volume {inside:.4g} {unit}" if np.isfinite(inside) else ""
         print(f"{segment.name:<20} {len(segment.faces):>7} faces{amount}")
-        faults += len(condition.hopeless) + len(condition.dirty)
-        for kind, each in (("fault", (*condition.hopeless, *condition.dirty)), ("note", condition.notes)):
+        harmless = [what for what in condition.dirty if is_mechanism and what.startswith(CROSSED)]
+        bad = [what for what in (*condition.hopeless, *condition.dirty) if what not in harmless]
+        faults += len(bad)
+        for kind, each in (("fault", bad), ("note", [*harmless, *condition.notes])):
             for what in each:
                 print(f"  {kind}: it {what}")
         if not condition.mendable:

@@ -517,7 +517,7 @@ def _draft(name: str, source: _Source, meshes: MeshesConfig, aperture: float) ->
     placement = placed(source.mesh, size)
     robot = [_robot_block(joint) for joint in source.robot or ()]
     joints = proposed_joints(source.mesh) if source.assembly and source.robot is None else ()
-    if source.robot is not None and way in ("auto", "articulated"):
+    if source.robot is not None and way in ("auto", "articulated", "rigid"):  # its links are rigid
         way, why = ("articulated" if robot else "rigid"), "as the file says"
     else:
         way, why = _chosen(way, joints)
