@@ -57,13 +57,13 @@ class JointValue:
     limits: Range
 
     def __str__(self) -> str:
-        """Value and interval for people, in degrees or millimetres."""
+        """Value for people, in degrees or millimetres, and its interval, unless it is given exactly."""
         factor, unit = SHOWN[self.unit]
         if self.interval is None:
             return f"{factor * self.value:.4g}{unit}"
         ends = [factor * end for end in self.interval]
         value, least, most = as_exact_as(ends[1] - ends[0], factor * self.value, *ends)
-        return f"{value}{unit} ({least} to {most})"
+        return f"{value}{unit}" if least == most else f"{value}{unit} ({least} to {most})"
 
     def facts(self) -> JsonObject:
         """Content for ``summary.json``."""
