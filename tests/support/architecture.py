@@ -124,13 +124,13 @@ MAY_IMPORT = {"torch": ("models/", "cli/tools.py"), "matplotlib": ("io/extras.py
 """The same of libraries that most installations lack: asked for where they are used, with the extra's name."""
 
 BUDGET = {
-    "src/mereo": (311_550, 162),
+    "src/mereo": (309_600, 162),
     "src/mereo_learning": (47_500, 22),
     "src/mereo_objects": (40_000, 28),
     "src/mereo_serving": (10_700, 13),
-    "src/mereo_viewer": (12_050, 5),
-    "src/mereo_experiments": (11_900, 17),
-    "tests": (296_250, 138),
+    "src/mereo_viewer": (12_030, 5),
+    "src/mereo_experiments": (11_850, 17),
+    "tests": (296_200, 138),
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
