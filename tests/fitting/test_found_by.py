@@ -35,7 +35,7 @@ from mereo.fitting.registration.answer_frame import (
     more_evident,
     search_modes,
 )
-from mereo.fitting.registration.register import Registrar
+from mereo.fitting.registration.register import ModesFit, Registrar
 from mereo.fitting.uncertainty import ModesOptimum
 from mereo.geometry.camera import PointCloud, SharedNoise, SightLines
 from mereo.models.model import Model
@@ -104,17 +104,18 @@ def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, mon
     assert found.located_by == "search" and found.taken
 
 
-def test_the_parameters_of_a_scene_are_fitted_to_what_may_be_a_view_of_the_object(
+def test_the_parameters_of_a_scene_are_fitted_to_what_the_modes_explain(
     liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    finish = Mock(side_effect=lambda modes: modes.registration)
-    monkeypatch.setattr(Registrar, "finish", lambda registrar, modes: finish(modes))
+    draw = Mock(side_effect=lambda modes: modes.registration)
+    monkeypatch.setattr(ModesFit, "with_draws", lambda modes, states: draw(modes))
+    monkeypatch.setattr(Registrar, "states_or_none", object())
     registrar = Registrar.of(liver).without_retries
-    assert answer_to(cloud, liver, registrar, 24).recognition.known is True and finish.call_count == 1
+    assert answer_to(cloud, liver, registrar, 24).recognition.known is True and draw.call_count == 1
     noise = PointCloud(cloud.points.mean(axis=0) + default_rng(0).uniform(-40, 40, cloud.points.shape))
-    assert answer_to(noise, liver, registrar, 24).recognition.known is False and finish.call_count == 1
+    assert answer_to(noise, liver, registrar, 24).recognition.known is False and draw.call_count == 1
     asked = replace(registrar, method="full")
-    assert answer_to(noise, liver, asked, 24).recognition.known is False and finish.call_count == 2
+    assert answer_to(noise, liver, asked, 24).recognition.known is False and draw.call_count == 2
 
 
 def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(by_network: Candidate) -> None:

@@ -16,7 +16,7 @@ from mereo.io.progress import duration, progress, tracked
 def wait(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     """Let a number of seconds pass, on a clock that only this moves; every step is worth a line."""
     now = [100.0]
-    monkeypatch.setattr(module, "monotonic", lambda: now[0])
+    monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(module, "LINE_EVERY_S", 0.0)
 
     def pass_by(seconds: float) -> None:
