@@ -438,7 +438,7 @@ class ResultPage:
             self._fill(gui, content)
 
     def _say(self) -> None:
-        """What a phone shows below the object, and a wide page beside it."""
+        """What a phone shows below the object, and a wide page at its side."""
         content = self.content
         self.heading.content = heading(content.title, content.facts)
         verdict = content.verdict and message(content.verdict, bad=content.is_doubtful)

@@ -16,7 +16,7 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
 from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
-from mereo.geometry.transforms import best_rotations
+from mereo.geometry.transforms import best_rotations, unit_rows
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Place, Recorder, Shares
 from mereo.scenes.parameters import play, random_state
 from mereo.scenes.random_states import state_points
@@ -74,9 +74,9 @@ class Drawn:
     directions: tuple[Numbers, ...] = ()
 
     @classmethod
-    def of(cls, scene: Scene, seed: int) -> "Drawn":
+    def of(cls, scene: Scene, seed: int, directions: Directions = NO_DIRECTIONS) -> "Drawn":
         """The random state of a seed, without attempts that the scene itself threw away."""
-        return cls.recorded(random_state(scene, seed).calls, seed)
+        return cls.recorded(random_state(scene, seed).calls, seed, directions)
 
     @classmethod
     def recorded(cls, calls: Sequence[Call], seed: int, directions: Directions = NO_DIRECTIONS) -> "Drawn":
@@ -98,9 +98,7 @@ class Drawn:
         """
         z = z.copy()
         for each in self.directions:
-            z[each] *= np.sqrt((len(each) - 1) / 2) / max(
-                float(np.linalg.norm(z[each])), 1e-9
-            )  # nothing is no direction
+            z[each] = np.sqrt((len(each) - 1) / 2) * unit_rows(z[each])
         return z
 
     def deformations(
@@ -182,7 +180,7 @@ class DrawnStates:
     def drawn(self, seed: int) -> Drawn:
         """``Drawn.of`` one of the seeds, recorded once: frames share their starts."""
         if seed not in self.recorded:
-            self.recorded[seed] = Drawn.recorded(random_state(self.scene, seed).calls, seed, self.directions)
+            self.recorded[seed] = Drawn.of(self.scene, seed, self.directions)
         return self.recorded[seed]
 
     @classmethod
@@ -222,7 +220,7 @@ class DrawnStates:
 
 
 def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call]]) -> Directions:
-    """Find the normal draws that are directions: rows of a call's numbers, or together all after the last such row.
+    """Find the normal draws that are directions: rows of a call's numbers, and together all that no such row has.
 
     Half as long a direction moves nothing, with its numbers in another order it does.
     """
@@ -234,7 +232,7 @@ def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call
         for call, end in [(call, end) for call, end in normal if call.key[0] not in directions]:
             numbers, row = np.arange(end - len(call.shares), end), call.shape[-1]
             parts = [part for part in numbers.reshape(-1, row) if is_direction(scene, played, drawn, part)]
-            rest = numbers[len(parts) * row :]
+            rest = np.setdiff1d(numbers, parts)
             parts += [part for part in (rest,) if is_direction(scene, played, drawn, part)]
             directions[call.key[0]] = [part - numbers[0] for part in parts]
     return directions
