@@ -162,7 +162,7 @@ def recording() -> Iterator[Recorder]:
     def recorded_descent(problem: Any, fit: Any, fresh: int, motion: Any = None) -> Any:
         drawn = descend(problem, fit, fresh, motion)
         stage = "draws settled" if stage_of_caller() == "settled" else "draws"
-        recorder.add(stage, problem.base, drawn.posed, drawn.surface, Misfit(np.nan, drawn.misfit, drawn.misfit))
+        recorder.add(stage, problem.base, drawn.posed, drawn.surface, Misfit(np.nan, drawn.misfit))
         return drawn
 
     def recorded_choice(problem: Any, drawn: Any, posed: Posed, rest: ScoredFit | None = None) -> bool:

@@ -16,7 +16,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.registration.register import CloudToFit, fit_frame
+from mereo.fitting.registration.answer_frame import search_modes
+from mereo.fitting.registration.register import CloudToFit
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
@@ -94,7 +95,7 @@ def row(
         grid = truth_grid(case.truth, cells)
         confusion = grid_confusion(grid, predict_grid(network, case.cloud, grid), len(network.names))
         alone = intersection_over_union(confusion, True)
-        modes = fit_frame(CloudToFit(case.cloud.points, case.unit), network, model)
+        modes = search_modes(CloudToFit(case.cloud.points, case.unit), model)
         best = modes.registration if states is None else modes.with_draws(states)
         near, far = errors(best, case)
         seen.append(near)

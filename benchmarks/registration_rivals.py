@@ -1,15 +1,14 @@
 """What readers use today, on the frames of benchmarks/fitting.py: ICP, and coherent point drift (CPD) in all its forms.
 
     python benchmarks/registration_rivals.py [OBJECT ...] [--seed S] [--views N] [--first I] [--cells C]
-        [--start network|truth ...] [--scans] [--search RIVAL ...]
+        [--scans] [--search RIVAL ...]
 
-Each rival gets the observed cloud and the model's visible surface, in the pose that the network's correspondences give
-(``--start network``, where our fit starts too) or in the best one for the true material points (``truth``), with its
-documented settings and with those that a search found. The answer is where all material points are, as a fit's is, and
-it is scored alike: mean IoU / mIoU of single views on C^3 cells, error of material points (median / 95 %, scene units)
-near observed points and elsewhere, median seconds without the network's.
+Each rival gets the observed cloud and the model's visible surface, in the best pose for the true material points, with
+its documented settings and with those that a search found; our fit searches. The answer is where all material points
+are, as a fit's is, and it is scored alike: mean IoU / mIoU of single views on C^3 cells, error of material points
+(median / 95 %, scene units) near observed points and elsewhere, median seconds.
 
-``--search`` tries settings from the first start that is asked for, one setting after the other, by the mean error of
+``--search`` tries settings, one setting after the other, by the mean error of
 all material points in half longest sides of the rest box. Search on seeds below 1,000,000 only; what it found on views
 0 to 4 of seed 700,000 (Bayesian CPD, and the atlas a second time, on view 0) is in rivals/settings.py.
 
@@ -40,14 +39,13 @@ from rivals.frames import Frame, surface_points, thinned_cloud
 from rivals.methods import Registered, Settings
 from rivals.settings import RIVALS, Rival
 
-from mereo.fitting.config import FitConfig
-from mereo.fitting.problem.correspondences import find_correspondences
-from mereo.fitting.registration.register import CloudToFit, fit_frame
+from mereo.fitting.registration.answer_frame import search_modes
+from mereo.fitting.registration.register import CloudToFit
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import TruthGrid, truth_grid
-from mereo.geometry.transforms import fit_rigid, robust_rigid, transform_points
+from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import scene_model
@@ -87,20 +85,12 @@ def vertices(mesh: SegmentedMesh) -> np.ndarray:
     return np.concatenate([segment.vertices for segment in mesh.segments])
 
 
-def prepare(case: Case, network: Model, model: StatisticalModel, surface: np.ndarray, start: str) -> Prepared:
-    """Both frames in the start poses."""
+def prepare(case: Case, model: StatisticalModel, surface: np.ndarray) -> Prepared:
+    """Both frames in their best poses."""
     assert case.material is not None
     empty = Frame(model, thinned_cloud(case.cloud.points), model.rest_points, np.eye(3), surface)
     shapes = (model.rest_points, model.mean)
-    if start == "truth":
-        poses = [fit_rigid(shape, case.material) for shape in shapes]
-    else:
-        found = find_correspondences(network, network.encode(case.cloud), model.rest_center, model.half)
-        assert found is not None
-        found, sigma = found.evenly(), FitConfig().start_sigma * model.half
-        follow = model.weights(found.rest, found.labels)
-        poses = [robust_rigid(follow(shape), found.points, found.confidence, sigma) for shape in shapes]
-    return Prepared(case, *(empty.started(shape, pose) for shape, pose in zip(shapes, poses, strict=True)))
+    return Prepared(case, *(empty.started(shape, fit_rigid(shape, case.material)) for shape in shapes))
 
 
 # --- scores -----------------------------------------------------------------------------------------------------------
@@ -130,12 +120,12 @@ def ours(view: Prepared, network: Model, grid: TruthGrid) -> dict[str, Row]:
     """Scores of the network alone and of the fit of the modes."""
     case, model = view.case, view.rest.model
     alone = score(predict_grid(network, case.cloud, grid), grid, len(network.names))
-    modes = scored(fit_frame(CloudToFit(case.cloud.points, case.unit), network, model).registration, case, grid)
+    modes = scored(search_modes(CloudToFit(case.cloud.points, case.unit), model).registration, case, grid)
     return {"network": (*alone, np.nan, True, np.empty(0), np.empty(0)), "modes (ours)": modes}
 
 
-def theirs(view: Prepared, rivals: dict[str, Rival], start: str, grid: TruthGrid) -> dict[str, Row]:
-    """Scores of all rivals from one start."""
+def theirs(view: Prepared, rivals: dict[str, Rival], grid: TruthGrid) -> dict[str, Row]:
+    """Scores of all rivals."""
     table = {}
     for name, rival in rivals.items():
         variants = {"": rival.default} | ({", tuned": rival.default | rival.tuned} if rival.tuned else {})
@@ -143,7 +133,7 @@ def theirs(view: Prepared, rivals: dict[str, Rival], start: str, grid: TruthGrid
             found, seconds = attempt(rival, settings, view)
             model = view.rest.model
             answer = Registration(model, found.material, "modes", np.empty(0), 1.0, True, np.nan, True, seconds)
-            table[f"{name}{suffix} ({start})"] = scored(answer, view.case, grid, found.finished)
+            table[f"{name}{suffix}"] = scored(answer, view.case, grid, found.finished)
     return table
 
 
@@ -214,7 +204,6 @@ def main() -> None:
     parser.add_argument("objects", nargs="*", default=["bunny", "liver", "rope", "engine", "human", "lizard"])
     for name, value in (("seed", 700_000), ("views", 5), ("first", 0), ("cells", 50)):
         parser.add_argument(f"--{name}", type=int, default=value)
-    parser.add_argument("--start", nargs="+", choices=("network", "truth"), default=["network"])
     parser.add_argument("--scans", action="store_true")
     parser.add_argument("--search", nargs="*", choices=list(RIVALS))
     options = parser.parse_args()
@@ -229,16 +218,13 @@ def main() -> None:
             scans(scene, model) if options.scans else views(scene, model, options.seed, options.first, options.views)
         )
         for case in cases:
-            started = {start: prepare(case, network, model, surface, start) for start in options.start}
-            first = started[options.start[0]]
-            everything.append(first)
+            view = prepare(case, model, surface)
+            everything.append(view)
             if options.search is not None:
                 continue
-            rivals = rivals or available(RIVALS, first)
+            rivals = rivals or available(RIVALS, view)
             grid = truth_grid(case.truth, options.cells)
-            table = ours(first, network, grid)
-            for start, view in started.items():
-                table |= theirs(view, rivals, start, grid)
+            table = ours(view, network, grid) | theirs(view, rivals, grid)
             for rival, row in table.items():
                 found[rival][name].append(row)
                 print(line(f"{case.name} {rival}", [row]), flush=True)

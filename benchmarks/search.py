@@ -1,6 +1,6 @@
-"""Who finds an object in a frame, whole or in part: a search without a network, the network, or both.
+"""How well an object is found in a frame, whole or in part.
 
-    python benchmarks/search.py [OBJECT ...] [--views N] [--seed S] [--conditions NAME ...] [--finders NAME ...]
+    python benchmarks/search.py [OBJECT ...] [--views N] [--seed S] [--conditions NAME ...]
                                 [--processes P] [--output FOLDER]
 
 Conditions: `whole`, `screen30` and `screen50` (an occluder with a straight edge hides that share of the object's
@@ -8,9 +8,6 @@ pixels), `picture50` (the picture's edge cuts off half), `tool30`, `hand30`, and
 `structured-light` and `time-of-flight` at 96 x 96 pixels, `structured-light-192` and `time-of-flight-192` at 192 x 192.
 Frames of the first kinds are whole depth images with a mask before a far wall; `whole` and those of cameras are cut
 out, so that they do not say what is around the object.
-
-Finders: `search` (no network), `network` (both fit modes and, where there are few, scene parameters), `both` (`--method
-auto`), and `before`, the network's fit that takes all around the object for empty and makes no search.
 
 A row: mean IoU / mIoU of the views on a grid of 60 cells, median and greatest seconds, share of views that the fit
 explains, and how many of those have an IoU below .8. With `--output` each row is kept in FOLDER/OBJECT-CONDITION.json
@@ -29,13 +26,11 @@ import numpy as np
 from occluded_views import Cut, occlude
 
 from mereo.api.objects import Object, load_object
-from mereo.fitting.config import AnswerMethod
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import TruthGrid, grid_confusion, intersection_over_union, truth_grid
 from mereo.geometry.solids import label_grid
 from mereo.io.sensor_frame import SensorFrame
-from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import find_object
 from mereo.scenes.registry import load_scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
@@ -60,8 +55,6 @@ CAMERAS: dict[str, tuple[ObservationName, int]] = {
 }
 
 CONDITIONS = ("whole", *CUTS, *CAMERAS)
-
-METHODS: dict[str, AnswerMethod] = {"search": "search", "network": "full", "both": "auto", "before": "auto"}
 
 WRONG = 0.8
 """IoU below which a frame that is explained was answered wrongly."""
@@ -94,55 +87,51 @@ def scored(truth: TruthGrid, mesh: SegmentedMesh) -> tuple[float, float]:
     return found.iou, found.miou
 
 
-def measured(name: str, condition: str, finder: str, seed: int, index: int) -> list[float]:
-    """IoU, mIoU, seconds, whether explained, whether by search, and states alike, of one view."""
+def measured(name: str, condition: str, seed: int, index: int) -> list[float]:
+    """IoU, mIoU, seconds, whether explained, and states alike, of one view."""
     frame, mesh = frame_of(name, condition, seed, index)
-    seen = find_object(frame, IsolationConfig(extent="whole" if finder == "before" else "auto"))
-    owned = loaded(name)
-    registrar = owned.registrar(METHODS[finder])
+    seen, owned = find_object(frame), loaded(name)
+    registrar = owned.registrar()
     assert registrar is not None
     registrar.prepare()
-    registrar = registrar.without_retries if finder == "before" else registrar
     started = time.perf_counter()
     answer = answer_frame(seen, owned.network, registrar, scene_unit=1.0)
     fit = answer.registration
     assert fit is not None
     seconds = time.perf_counter() - started
-    return [*scored(truth_grid(mesh, CELLS), fit.mesh), seconds, fit.accepted, answer.located_by == "search", fit.alike]
+    return [*scored(truth_grid(mesh, CELLS), fit.mesh), seconds, fit.accepted, fit.alike]
 
 
-def row(name: str, condition: str, finders: list[str], seed: int, views: int) -> dict[str, Any]:
-    """All finders on the same views."""
-    result: dict[str, Any] = {"object": name, "condition": condition, "seed": seed, "views": views}
-    for finder in finders:
-        result[finder] = [measured(name, condition, finder, seed, index) for index in range(views)]
-    return result
+def row(name: str, condition: str, seed: int, views: int) -> dict[str, Any]:
+    """Measurements of all views."""
+    measurements = [measured(name, condition, seed, index) for index in range(views)]
+    return {"object": name, "condition": condition, "seed": seed, "views": views, "measured": measurements}
 
 
-def line(result: dict[str, Any], finder: str) -> str:
-    """One finder's row of the table."""
-    table = np.array(result[finder], dtype=np.float64)
+def line(result: dict[str, Any]) -> str:
+    """Row of the table."""
+    table = np.array(result["measured"], dtype=np.float64)
     iou, miou = table[:, :2].mean(axis=0)
     accepted = table[:, 3] > 0
     wrong = int((accepted & (table[:, 0] < WRONG)).sum())
     cells = (
-        *(result["object"], result["condition"], finder, f"{iou:.3f} / {miou:.3f}"),
+        *(result["object"], result["condition"], f"{iou:.3f} / {miou:.3f}"),
         *(f"{np.median(table[:, 2]):.1f} ({table[:, 2].max():.1f}) s", f"{accepted.mean():.0%}", wrong),
-        *(f"{table[:, 4].mean():.0%}", f"{table[:, 5].max():.0f}"),
+        f"{table[:, 4].max():.0f}",
     )
     return f"| {' | '.join(map(str, cells))} |"
 
 
-def work(task: tuple[str, str, list[str], int, int, Path | None]) -> dict[str, Any]:
+def work(task: tuple[str, str, int, int, Path | None]) -> dict[str, Any]:
     """One row, from the folder where it is there."""
-    name, condition, finders, seed, views, folder = task
+    name, condition, seed, views, folder = task
     kept = None if folder is None else folder / f"{name}-{condition}.json"
     if kept is not None and kept.is_file():
         result: dict[str, Any] = json.loads(kept.read_text("utf-8"))
-        if (result["seed"], result["views"]) != (seed, views) or not set(finders) <= set(result):
+        if (result["seed"], result["views"]) != (seed, views) or "measured" not in result:
             raise ValueError(f"{kept} is of other settings: name another --output")
         return result
-    result = row(name, condition, finders, seed, views)
+    result = row(name, condition, seed, views)
     if kept is not None:
         partial = kept.with_suffix(".part")
         partial.write_text(json.dumps(result), encoding="utf-8")
@@ -157,7 +146,6 @@ def main() -> None:
     parser.add_argument("--views", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1000)
     parser.add_argument("--conditions", nargs="+", default=["whole"], choices=CONDITIONS)
-    parser.add_argument("--finders", nargs="+", default=["search", "network"], choices=list(METHODS))
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
@@ -165,24 +153,17 @@ def main() -> None:
         given.output.mkdir(parents=True, exist_ok=True)
     note = " (test seed)" if given.seed >= TEST_SEED_START else ""
     print(f"{given.views} views of seed {given.seed}{note}\n")
-    print(
-        "| object | condition | finder | IoU / mIoU | median (most) | explained | of these wrong | by search | alike |"
-    )
-    print("|---|---|---|---|---|---|---|---|---|")
-    tasks = [
-        (n, c, given.finders, given.seed, given.views, given.output) for c in given.conditions for n in given.objects
-    ]
+    print("| object | condition | IoU / mIoU | median (most) | explained | of these wrong | alike |")
+    print("|---|---|---|---|---|---|---|")
+    tasks = [(n, c, given.seed, given.views, given.output) for c in given.conditions for n in given.objects]
     results: list[dict[str, Any]] = []
     with ProcessPoolExecutor(given.processes) as pool:
         for result in pool.map(work, tasks):
             results.append(result)
-            for finder in given.finders:
-                print(line(result, finder), flush=True)
+            print(line(result), flush=True)
     for condition in given.conditions:
-        for finder in given.finders:
-            chosen = [result[finder] for result in results if result["condition"] == condition]
-            whole = {"object": "mean", "condition": condition, finder: [one for part in chosen for one in part]}
-            print(line(whole, finder))
+        every = [each for result in results if result["condition"] == condition for each in result["measured"]]
+        print(line({"object": "mean", "condition": condition, "measured": every}))
 
 
 if __name__ == "__main__":

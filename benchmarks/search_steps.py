@@ -1,4 +1,4 @@
-"""See how an object is found without a network, step by step, in a frame that shows a half of it.
+"""See how an object is found, step by step, in a frame that shows a half of it.
 
     python benchmarks/search_steps.py [--scene rope] [--output search_steps.png]
 
@@ -18,7 +18,6 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import bend_by_few
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm
 from mereo.fitting.search import ROUNDS, screen_poses, search
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.random_states import kept_model
@@ -60,7 +59,7 @@ def main(options: Options) -> None:
     seen = find_object(cut.frame())
     model = kept_model(scene)
     evidence = Evidence.of(seen.cloud.points, lines=seen.lines)
-    problem = Problem(model, NetworkTerm.none(model), evidence, KNOWN_SCALE_STD, FitConfig())
+    problem = Problem(model, evidence, KNOWN_SCALE_STD, FitConfig())
     rigid = screen_poses(problem, ROUNDS[0])
     bent = bend_by_few(problem, rigid, ROUNDS[0].fitted)
     found = search(problem)

@@ -22,7 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from shutil import copytree, ignore_patterns
 from tempfile import TemporaryDirectory
@@ -106,7 +106,6 @@ class Frame:
     seen: Observation
     truth: TruthGrid
     names: int
-    by_search: bool
 
 
 def make_frames(objects: Sequence[str], views: int, seed: int, clean: bool) -> list[Frame]:
@@ -115,7 +114,7 @@ def make_frames(objects: Sequence[str], views: int, seed: int, clean: bool) -> l
         for kind, view, seen in own_views(load_scene(name), views, seed):
             if kind == "clean" or not clean:
                 truth = truth_grid(view.mesh, CELLS)
-                frames.append(Frame(name, seen, truth, len(view.mesh.names), kind == "occluded"))
+                frames.append(Frame(name, seen, truth, len(view.mesh.names)))
     return frames
 
 
@@ -133,10 +132,7 @@ def answer_frames(path: Path) -> None:
             registrars[frame.name] = thing.network, sized(registrar)
         score, start = 0.0, time.process_time()
         try:
-            network, registrar = registrars[frame.name]
-            if frame.by_search:
-                network, registrar = None, replace(registrar, method="search")
-            answer = answer_frame(frame.seen, network, registrar)
+            answer = answer_frame(frame.seen, *registrars[frame.name])
             assert answer.registration is not None
             labels = labels_on(answer.registration.mesh, frame.truth.grid)
             score = intersection_over_union(grid_confusion(frame.truth, labels, frame.names)).miou

@@ -24,7 +24,7 @@ from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import truth_grid
 from mereo.io.progress import progress
-from mereo.models.calibration import Calibration, RadiusFactors, Recognizing, Scaling, SignName, Usual
+from mereo.models.calibration import Calibration, RadiusFactors, Recognizing, Scaling, Usual
 from mereo.models.model import Model, scaled_array
 from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
@@ -86,9 +86,9 @@ def calibrate(
                 signs.add(answer)
                 # of noisy views the network sees less: a temperature that covered it would make all others vague
                 if view.is_clean:
-                    assert answer.likelier is not None and answer.likelier.code is not None
+                    assert answer.encoded.code is not None
                     points, labels = sample_cells(truth_grid(view.mesh, CELLS), SAMPLED_CELLS)
-                    logits.append(bare.logits(answer.likelier.code, points))
+                    logits.append(bare.logits(answer.encoded.code, points))
                     truth.append(np.minimum(labels, logits[-1].shape[1] - 1).astype(np.uint8))
             shown.advance()
     joint, labels = np.concatenate(logits), np.concatenate(truth)
@@ -308,9 +308,9 @@ class RecognitionSigns:
         return Recognizing(clean=usual_of(self.clean), noisy=noisy)
 
 
-def usual_of(signs: Sequence[Signs]) -> dict[SignName, Usual]:
+def usual_of(signs: Sequence[Signs]) -> dict[str, Usual]:
     """What is usual of each sign, from views of the object, robustly; no less wide than for objects without them."""
-    result: dict[SignName, Usual] = {}
+    result: dict[str, Usual] = {}
     for name in MEASURED:
         values = [each.logarithms[name] for each in signs if name in each.logarithms]
         if values:

@@ -344,15 +344,15 @@ def find_candidates(
 ) -> Candidates:
     """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
     answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)
-    assert answer.likelier is not None and answer.candidate is not None and answer.likelier.code is not None
+    code, encoding = answer.encoded.code, answer.encoded.timings_s["encode"]
+    assert answer.candidate is not None and code is not None
     started = time.perf_counter()
-    code, encoding = answer.likelier.code, answer.likelier.timings_s["encode"]
     labels = network_labels(model, code, grid)
     network = Candidate(labels, encoding + time.perf_counter() - started)
     if registrar is None:
         return Candidates(code, {"network": network}, "network", seconds=network.seconds)
     known, names = answer.recognition.known, names_for(registrar)
-    if answer.candidate.modes is None or answer.registration is None:  # too few correspondences, whoever is scored
+    if answer.candidate.modes is None or answer.registration is None:  # nothing was found, whoever is scored
         return Candidates(code, dict.fromkeys(names, network), "network", known, answer.seconds)
     registrations = {"modes": answer.candidate.modes.registration, "full": answer.registration}
     each: dict[AnswerName, Candidate] = {"network": network}

@@ -139,11 +139,11 @@ PLIERS = str(weights_of("pliers"))
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_previews: None) -> Path:
-    """An empty folder that is the working one, with a frame of the rope, a plane, and what is no frame."""
+    """An empty folder that is the working one, with a frame of the rope, a bowl, and what is no frame."""
     monkeypatch.chdir(tmp_path)
     np.save("rope.npy", load_view("rope").depth.to_points().points)
     x, y = np.meshgrid(np.linspace(-0.05, 0.05, 20), np.linspace(-0.05, 0.05, 20))
-    np.save("plane.npy", np.stack([x, y, 0.5 + 0.1 * x * y], axis=2))
+    np.save("bowl.npy", np.stack([x, y, 0.5 + 20.0 * (x**2 + y**2)], axis=2))
     np.save("text.npy", np.array(["no frame"]))
     return tmp_path
 
@@ -166,17 +166,17 @@ def test_what_is_not_the_object_has_a_status_of_its_own_and_a_failure_outweighs_
     here: Path, capfd: pytest.CaptureFixture
 ) -> None:
     asked = ("--weights", PLIERS, "--method", "modes", "--json", "--output")
-    assert mereo("reconstruct", "plane.npy", *asked, "one") == 3
+    assert mereo("reconstruct", "bowl.npy", *asked, "one") == 3
     found = json.loads(capfd.readouterr().out)
     assert found["recognition"]["known"] is False and found["verdict"] == "no"
     assert found["unit_m"] is None, "another object's size says nothing"
-    assert mereo("reconstruct", "plane.npy", "rope.npy", *asked, "many") == 3
+    assert mereo("reconstruct", "bowl.npy", "rope.npy", *asked, "many") == 3
     frames = json.loads(capfd.readouterr().out)["frames"]
-    assert [Path(frame["output"]).name for frame in frames] == ["plane", "rope"]
+    assert [Path(frame["output"]).name for frame in frames] == ["bowl", "rope"]
     assert frames[0]["recognition"] == found["recognition"]
     assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--json", "--output", "known") == 0
     assert json.loads(capfd.readouterr().out)["verdict"] == "yes"
-    assert mereo("reconstruct", "plane.npy", "text.npy", *asked, "more") == 2
+    assert mereo("reconstruct", "bowl.npy", "text.npy", *asked, "more") == 2
     out, err = capfd.readouterr()
     assert out == "" and "text.npy" in err
 

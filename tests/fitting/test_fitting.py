@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from answers import fit_correspondences
-from fit_cases import IN_FRONT, SCENE, said, seen, shown, true_material
+from answers import fit_cloud, fit_modes
+from fit_cases import IN_FRONT, SCENE, seen, shown, true_material
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -16,11 +16,11 @@ from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, Shape, approach, fit
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.modes import ScoredFit, fit_wide, narrowing, refined, shaken
-from mereo.fitting.problem.correspondences import Correspondences, nothing
-from mereo.fitting.problem.evidence import Evidence
+from mereo.fitting.problem.evidence import UNDECIDED, Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm, Prior, are_near
+from mereo.fitting.problem.residuals import Prior, are_near
+from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
@@ -37,10 +37,6 @@ from mereo.synthesis.examples import View, sample_view
 CLEAN = replace(GenerateConfig(), noise_std=0.0)
 
 
-def told(model: StatisticalModel, view: View, error: float = 0.0) -> Correspondences:
-    return said(model, true_material(model, view), max(error, 1e-12))
-
-
 @pytest.fixture(scope="module")
 def view() -> View:
     return sample_view(SCENE, CLEAN, example_rng(5, 0))
@@ -48,14 +44,16 @@ def view() -> View:
 
 @pytest.fixture(scope="module")
 def registration(model: StatisticalModel, view: View) -> Registration:
-    return fit_correspondences(view.depth.to_points().points, told(model, view, 1.0), model, 1.0)
+    return fit_cloud(view.depth.to_points().points, model, true_material(model, view))
 
 
 @pytest.mark.parametrize(("index", "method"), [*((index, "modes") for index in range(4)), (1, "draws")])
 def test_a_known_state_is_found(model: StatisticalModel, index: int, method: str) -> None:
     view = sample_view(SCENE, CLEAN, example_rng(5, index))
-    error, states = (0.0, None) if method == "modes" else (0.5, DrawnStates.of(SCENE, model, 100, 1000))
-    found = fit_correspondences(view.depth.to_points().points, told(model, view, error), model, 1.0, states)
+    fitted = fit_modes(view.depth.to_points().points, model, 1.0, true_material(model, view))
+    found = fitted.registration
+    if method == "draws":
+        found = fitted.with_draws(DrawnStates.of(SCENE, model, 100, 1000))
     assert found.method == method
     assert np.median(norm(found.material - true_material(model, view), axis=1)) < 0.05
     assert found.accepted and found.explained > 0.99 and found.beyond_states < 0.05
@@ -64,7 +62,8 @@ def test_a_known_state_is_found(model: StatisticalModel, index: int, method: str
 def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, registration: Registration) -> None:
     assert registration.ruled_out == 0.0 and recognize(registration).known is True
     points = view.depth.to_points().points
-    half = fit_correspondences(points[points[:, 0] < np.median(points[:, 0])], told(model, view), model, 1.0)
+    left = points[points[:, 0] < np.median(points[:, 0])]
+    half = search_modes(CloudToFit(left, 1.0, lines=replace(UNDECIDED, other_lines="past")), model).registration
     assert half.ruled_out is not None and half.ruled_out > 0.1
     said = recognize(half)
     assert said.known is not True and said.reason is not None
@@ -108,7 +107,7 @@ def test_an_object_at_rest_is_found_to_be_at_rest(model: StatisticalModel, noise
     material = transform_points(IN_FRONT, model.rest_points)
     points = seen(model.rest.transformed(IN_FRONT))
     points = points + default_rng(0).normal(scale=noise, size=points.shape)
-    found = fit_correspondences(unit * points, said(model, material).scaled(unit), model, unit)
+    found = fit_cloud(unit * points, model, material, unit)
     assert found.method == "rest" and found.accepted
     # a rigid motion of the rest model, and the right one
     apart = [norm(np.diff(places[::50], axis=0), axis=1) for places in (found.material / unit, material)]
@@ -120,12 +119,12 @@ def test_an_object_at_rest_is_found_to_be_at_rest(model: StatisticalModel, noise
 @pytest.mark.parametrize("excess", [0.1, 0.3, 1.0])
 def test_a_bent_object_is_not(model: StatisticalModel, excess: float) -> None:
     points, material = shown(model, excess)
-    assert fit_correspondences(points, said(model, material), model, 1.0).method == "modes"
+    assert fit_cloud(points, model, material).method == "modes"
 
 
 def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(model: StatisticalModel) -> None:
     points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
-    clean = ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    clean = fit_modes(points, model, 1.0, material)
     noisy = replace(clean, problem=clean.problem.with_noise(0.2))
     assert noisy.may_take_draws and not clean.may_take_draws
     found = noisy.with_draws(DrawnStates.of(SCENE, model, 30))
@@ -140,12 +139,12 @@ def states(model: StatisticalModel) -> DrawnStates:
 @pytest.fixture(scope="module")
 def fitted(model: StatisticalModel) -> ModesFit:
     points, material = shown(model, 0.5)
-    return ModesFit.of(CloudToFit(points, 1.0), said(model, material), model)
+    return fit_modes(points, model, 1.0, material)
 
 
 @pytest.fixture(scope="module")
 def problem(fitted: ModesFit, states: DrawnStates) -> DrawsProblem:
-    return DrawsProblem.of(fitted.problem, states, fitted.correspondences)
+    return DrawsProblem.of(fitted.problem, states)
 
 
 @pytest.fixture(scope="module")
@@ -164,7 +163,7 @@ def test_a_secant_agrees_with_the_step_and_only_there() -> None:
 
 def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
     points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
-    shape = Shape.of(points, 0.04 * model.half, np.ones(len(points)))
+    shape = Shape(points, 0.04 * model.half, 1.0)
     drawn = Drawn.of(SCENE, states.seeds[3])
     start = lay_on_shape(states, shape, drawn, drawn.z)
     found = approach(states, shape, start, 3)
@@ -190,7 +189,7 @@ def test_a_second_pass_follows_where_the_first_has_failed(
     """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
     wrong = replace(fitted.posed, z=np.full_like(fitted.posed.z, 2.0))
     poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
-    poor = replace(poor, jumps=0, network_start=False)
+    poor = replace(poor, jumps=0)
     once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
     assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
     monkeypatch.setattr("mereo.fitting.draws.fit.refine", None)  # not called where the first explains the cloud
@@ -246,7 +245,7 @@ def stuck(model: StatisticalModel, index: int, other: int, noise: float = 0.0) -
     )
     points = seen(model.mesh(posed.place(model.material(posed.z))))
     points = points * (1 + default_rng(0).normal(scale=noise / 150.0, size=(len(points), 1)))
-    problem = Problem(model, NetworkTerm.none(model), Evidence.of(points), KNOWN_SCALE_STD, FitConfig())
+    problem = Problem(model, Evidence.of(points), KNOWN_SCALE_STD, FitConfig())
     return problem, refined(problem, fit_wide(problem, replace(posed, z=model.library[other].astype(float))))
 
 
@@ -263,8 +262,6 @@ def test_what_is_explained_hopeless_or_a_cameras_noise_is_left(robot: Statistica
     assert right.explains(problem) and shaken(problem, right) is right
     other_thing = replace(wrong, misfit=replace(wrong.misfit, cloud=5.0))
     assert shaken(problem, other_thing) is other_thing
-    # a tracker has no time
-    assert shaken(replace(problem, config=replace(problem.config, retries=False)), wrong) is wrong
     assert shaken(replace(problem, scale_std=OPEN_SCALE_STD), wrong) is wrong
     noisy, fitted = stuck(robot, 4, 4, noise=0.5)
     assert not fitted.explains(noisy) and shaken(noisy, fitted).misfit.total > 0.9 * fitted.misfit.total
@@ -283,7 +280,7 @@ def test_states_near_one_tell_of_it_where_they_lie_on_a_curved_set_and_not_where
 
 def test_a_track_looks_for_other_states_where_it_is_wrong_and_not_again_at_once(robot: StatisticalModel) -> None:
     problem, wrong = stuck(robot, 4, 5)
-    fitted = ModesFit(problem, nothing(), 1.0, wrong.posed, 0.0)
+    fitted = ModesFit(problem, 1.0, wrong.posed, 0.0)
     track = Track.of(fitted, 0.0, TrackConfig(), FitConfig())
     better, after = explore(track, fitted, 1.0)
     left = problem.misfit(better.posed).cloud

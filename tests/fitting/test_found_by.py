@@ -1,4 +1,4 @@
-"""Who finds the object: the network at once where it can, a search where the network's fit explains too little."""
+"""Who finds the object, and how noise and strays are met."""
 
 from dataclasses import replace
 from typing import Any
@@ -12,7 +12,7 @@ from numpy.random import default_rng
 from scipy.spatial import cKDTree
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.problem import correspondences
+from mereo.fitting.problem.correspondences import find_correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import (
     ACCEPTED,
@@ -25,26 +25,16 @@ from mereo.fitting.problem.problem import (
     shared_variance,
 )
 from mereo.fitting.problem.residuals import Surface
-from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.answer_frame import (
-    ASTRAY,
-    answer_frame,
-    fit_hypotheses,
-    is_astray,
-    misfit_in,
-    more_evident,
-    search_modes,
-)
+from mereo.fitting.registration.answer import Candidate
+from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import ModesFit, Registrar
+from mereo.fitting.search import screen_poses
 from mereo.fitting.uncertainty import ModesOptimum
-from mereo.geometry.camera import PointCloud, SharedNoise, SightLines
+from mereo.geometry.camera import PointCloud, SharedNoise
 from mereo.models.model import Model
 from mereo.models.weights import load_model
-from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import observe
 from mereo.synthesis.sample_views import load_view
-
-HYPOTHESES = "mereo.fitting.registration.answer_frame"
 
 
 @pytest.fixture(scope="module")
@@ -57,51 +47,39 @@ def cloud() -> PointCloud:
     return load_view("liver").depth.to_points()
 
 
-@pytest.fixture
-def confused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A network that takes each place of the object for another one."""
-    honest = correspondences.find_correspondences
+def test_a_networks_guess_is_tried_first(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
+    screened = Mock(wraps=screen_poses)
+    monkeypatch.setattr("mereo.fitting.search.screen_poses", screened)
+    assert answer_to(cloud, liver, Registrar.of(liver), 24).recognition.known is True and not screened.called
+    assert answer_to(cloud, liver, Registrar.of(liver, "search"), 24).recognition.known is True and screened.called
+
+
+@pytest.mark.parametrize("unit", [1.0, None])
+def test_a_network_that_is_lost_does_no_harm(
+    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch, unit: float | None
+) -> None:
+    """One that takes each place of the object for another one."""
 
     def lying(*given: Any) -> Any:
-        found = honest(*given)
+        found = find_correspondences(*given)
+        assert found is not None
         return replace(found, rest=default_rng(0).permutation(found.rest))
 
+    right = answer_to(cloud, liver, Registrar.of(liver), 24, scene_unit=unit)
     monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", lying)
+    found = answer_to(cloud, liver, Registrar.of(liver), 24, scene_unit=unit)
+    assert found.recognition.known is True
+    assert np.median(norm(found.registration.material - right.registration.material, axis=1)) < 1.0
 
 
-def answer(liver: Model, cloud: PointCloud, method: Any = "auto") -> Answer:
-    return answer_to(cloud, liver, Registrar.of(liver, method), 24)
-
-
-@pytest.fixture(scope="module")
-def by_network(liver: Model, cloud: PointCloud) -> Candidate:
-    found = answer(liver, cloud).candidate
-    assert found is not None and found.modes is not None
-    return found
-
-
-def test_a_network_that_understands_is_not_doubted_and_other_methods_ask_nobody_else(
-    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
-) -> None:
-    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", None)
-    assert answer(liver, cloud).located_by == "network"
-    request.getfixturevalue("confused")
-    assert answer(liver, cloud, "modes").located_by == "network"
-
-
-@pytest.mark.usefixtures("confused")
-def test_a_search_is_asked_too_where_the_network_is_lost(liver: Model, cloud: PointCloud) -> None:
-    found = answer(liver, cloud)
+def test_weights_calibrate_what_a_search_finds_and_say_how_sure_they_are(liver: Model, cloud: PointCloud) -> None:
+    found = answer_to(cloud, liver, Registrar.of(liver), 24)
     assert found.located_by == "search" and found.taken and found.registration is not None
     assert found.registration.accepted and found.recognition.known is True
-    assert found.registration.radius_scale is not None  # by the weights' calibration, as those of the network's fits
-    assert all(0 < segment.confidence <= 1 for segment in found.reconstruction.segments)  # the network's, all the same
-
-
-def test_the_network_is_left_out_on_request(liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mereo.fitting.registration.register.find_correspondences", None)
-    found = answer(liver, cloud, "search")
-    assert found.located_by == "search" and found.taken
+    assert found.registration.radius_scale is not None
+    assert all(0 < segment.confidence <= 1 for segment in found.reconstruction.segments)  # the network's
+    alone = answer_to(cloud, liver, None, 24)
+    assert alone.located_by == "network" and alone.registration is None and alone.recognition.known == "unsure"
 
 
 def test_the_parameters_of_a_scene_are_fitted_to_what_the_modes_explain(
@@ -110,56 +88,12 @@ def test_the_parameters_of_a_scene_are_fitted_to_what_the_modes_explain(
     draw = Mock(side_effect=lambda modes: modes.registration)
     monkeypatch.setattr(ModesFit, "with_draws", lambda modes, states: draw(modes))
     monkeypatch.setattr(Registrar, "states_or_none", object())
-    registrar = Registrar.of(liver).without_retries
+    registrar = Registrar.of(liver)
     assert answer_to(cloud, liver, registrar, 24).recognition.known is True and draw.call_count == 1
     noise = PointCloud(cloud.points.mean(axis=0) + default_rng(0).uniform(-40, 40, cloud.points.shape))
     assert answer_to(noise, liver, registrar, 24).recognition.known is False and draw.call_count == 1
     asked = replace(registrar, method="full")
     assert answer_to(noise, liver, asked, 24).recognition.known is False and draw.call_count == 2
-
-
-def test_the_state_with_the_greater_evidence_is_taken_whatever_its_unit(by_network: Candidate) -> None:
-    right = by_network.modes
-    astray = replace(right, posed=replace(right.posed, translation=right.posed.translation + 3.0))
-    wrong = replace(by_network, modes=astray, located_by="search")
-    assert misfit_in(right, astray) > misfit_in(right, right)
-    assert more_evident(by_network, wrong) is by_network and more_evident(wrong, by_network) is by_network
-    assert more_evident(replace(by_network, modes=None), wrong) is wrong
-    half = replace(right.posed, log_scale=right.posed.log_scale - np.log(2.0), translation=right.posed.translation / 2)
-    halved = replace(by_network, modes=replace(right, unit=2 * right.unit, posed=half))
-    assert more_evident(by_network, halved) is by_network and more_evident(halved, by_network) is by_network
-    # one that alone explains the frame is taken, also with less evidence
-    strict = replace(right.problem, config=replace(right.problem.config, tolerance=1e-3))
-    refused = replace(by_network, modes=replace(right, problem=strict))
-    close = replace(right.posed, translation=right.posed.translation + 0.05)
-    searched = replace(by_network, modes=replace(right, posed=close), located_by="search")
-    assert searched.is_accepted and not refused.is_accepted
-    assert more_evident(refused, searched) is searched
-
-
-def test_a_network_far_from_what_it_starts_is_no_start(by_network: Candidate) -> None:
-    """Weights after a minute of training explain a frame by chance, with the object turned end for end."""
-    assert by_network.modes is not None and not is_astray(by_network)
-    found = by_network.modes.correspondences
-    guessed = replace(found, rest=default_rng(0).permutation(found.rest))
-    lucky = replace(by_network, modes=replace(by_network.modes, correspondences=guessed))
-    assert lucky.is_accepted and is_astray(lucky)
-    displaced = lucky.displaced(by_network.modes.registration)
-    assert displaced is not None and displaced > ASTRAY
-
-
-def test_a_search_is_asked_too_where_a_part_is_hidden(
-    liver: Model, cloud: PointCloud, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    across = cloud.points[:, 0] / cloud.points[:, 2]
-    cut = across <= np.quantile(across, 0.2)
-    searched = Mock(wraps=search_modes)
-    monkeypatch.setattr(f"{HYPOTHESES}.search_modes", searched)
-    seen, registrar = observe(PointCloud(cloud.points[~cut])), Registrar.of(liver)
-    vars(seen)["lines"] = SightLines(np.empty((0, 3)), 0.5 * cloud.points[cut], "past")
-    assert answer_frame(seen, liver, registrar, resolution=24).taken and searched.called
-    searched.reset_mock()
-    assert answer_frame(observe(cloud), liver, registrar, resolution=24).taken and not searched.called
 
 
 @pytest.fixture(scope="module")
@@ -184,33 +118,17 @@ def with_rim(points: np.ndarray) -> np.ndarray:
 
 
 def fitted(registrar: Registrar, points: np.ndarray, keep_all: bool = False, unit: float = 1.0) -> Candidate:
-    return fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, keep_all, unit)[0]
+    return search_hypotheses(observe(PointCloud(points)), registrar, keep_all, unit)[0]
 
 
 def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: np.ndarray) -> None:
-    clean, likelier = fit_hypotheses(observe(PointCloud(points)), registrar.network, registrar, False, 1.0)
+    clean, likelier = search_hypotheses(observe(PointCloud(points)), registrar, False, 1.0)
     found = fitted(registrar, with_rim(points))
     assert clean.hypothesis.dropped == 0 and clean.encoded is likelier
     assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
     moved = norm(found.modes.registration.material - clean.modes.registration.material, axis=1)
     assert np.median(moved) < 0.2
     assert fitted(registrar, with_rim(points), keep_all=True).hypothesis.dropped == 0
-
-
-def test_points_that_a_fit_explains_are_given_back_beside_strays(
-    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    contaminated = with_rim(points)
-    lost = default_rng(0).choice(len(points), 10, replace=False)
-
-    def hasty(cloud: PointCloud, axes: str, keep_all: bool) -> tuple[Reading, Reading]:
-        keep = np.arange(len(cloud)) < len(points)
-        keep[lost] = False
-        return Reading(cloud, keep), Reading.of_all(cloud)
-
-    monkeypatch.setattr("mereo.reconstruction.observation.readings", hasty)
-    keep = fitted(registrar, contaminated).hypothesis.keep
-    assert keep[lost].all() and not keep[len(points) :].any()
 
 
 def test_an_answer_says_which_points_it_is_of(registrar: Registrar, points: np.ndarray) -> None:

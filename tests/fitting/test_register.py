@@ -15,12 +15,10 @@ from folder_contents import read_json
 from numpy.testing import assert_allclose, assert_array_equal
 from trimesh.remesh import subdivide
 
-import mereo
-from mereo.api.objects import Object
 from mereo.fitting.draws.playback import DrawnStates
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.answer_frame import answer_frame, search_modes
 from mereo.fitting.registration.register import (
     ChangedSceneWarning,
     CloudToFit,
@@ -68,7 +66,7 @@ def network(model: Model, view: SampleView) -> Reconstruction:
 
 @pytest.fixture(scope="module")
 def found(model: Model, view: SampleView) -> Answer:
-    return answer_to(view.depth.to_points(), model, Registrar.of(model, "modes"), 48, label_points=True)
+    return answer_to(view.depth.to_points(), model, Registrar.of(model, "modes"), 48, label_points=True, scene_unit=1.0)
 
 
 def iou(view: SampleView, result: Reconstruction) -> float:
@@ -123,7 +121,7 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
     changed = replace(scene, rest=SegmentedMesh((finer, *pieces)))
     counts = rf"has {len(finer.vertices)} vertices, theirs {len(base.vertices)}"
     said = rf"'rope' has other .* \(its segment 'base' {counts}\)"
-    fitted = Registrar.of(model, "modes").fit_modes(CloudToFit(view.depth.to_points().points))
+    fitted = search_modes(CloudToFit(view.depth.to_points().points), statistical_model_of(model))
     monkeypatch.setattr(register, "load_scene", lambda name: changed)
     for registrar in (Registrar.of(model), Registrar.of(model, scene=changed)):
         with pytest.warns(ChangedSceneWarning, match=f"{said}: it has changed since .* only the modes .* train them"):
@@ -144,7 +142,7 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
 ) -> None:
     """The fit of its draws takes long, and is the command's above; here it is asked for, and with what."""
     registrar = Registrar.of(model)
-    fitted = registrar.fit_modes(CloudToFit(view.depth.to_points().points))
+    fitted = search_modes(CloudToFit(view.depth.to_points().points), registrar.model)
     assert fitted.rest is None
     modes = replace(registrar, method="modes")
     assert modes.finish(fitted).method == "modes" and "states_or_none" not in vars(modes)
@@ -169,20 +167,17 @@ def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
 def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})
-    found = answer_to(stretched, model, Registrar.of(without_scene).without_retries, 32)
+    found = answer_to(stretched, model, Registrar.of(without_scene), 32)
     assert found.registration is not None and not found.registration.accepted and not found.taken
     forced = answer_to(stretched, model, Registrar.of(model, "modes"), 32)
     assert forced.taken and forced.registration is not None and not forced.registration.accepted
 
 
 def test_where_no_registration_is_found_auto_says_why(model: Model, view: SampleView) -> None:
-    other = replace(model, names=tuple(f"other_{i}" for i in range(len(model.names))))
-    registrar = Registrar(other, statistical_model_of(model))
-    found = answer_to(view.depth.to_points(), other, registrar, 32)
-    assert not found.taken and found.registration is None and "they must be of one object" in str(found.refusal)
-    known = Object(other, None, {"modes": replace(registrar, method="modes")})
-    with pytest.raises(ValueError, match="they must be of one object"):
-        mereo.reconstruct(view.depth.to_points(), known, "modes", resolution=32)
+    cloud = PointCloud(view.depth.to_points().points / 1000.0)
+    found = answer_to(cloud, model, Registrar.of(model), 32, scene_unit=1.0)
+    assert not found.taken and found.registration is None and "correct the unit of the frame" in str(found.refusal)
+    assert found.recognition.known is False and len(found.surfaces.segments) == len(model.names)
 
 
 MOTION = "the pose is .* must be 4 x 4 finite numbers: a rotation and a translation"
@@ -241,7 +236,7 @@ def test_a_registration_is_as_far_off_as_its_points_are(engine: Model, engine_vi
     statistical = engine.statistical_model
     truth = true_material(statistical, engine_view)
     cloud = engine_view.depth.to_points()
-    found = Registrar.of(engine, "modes").fit_modes(CloudToFit(cloud.points, scene_unit=1.0)).registration
+    found = search_modes(CloudToFit(cloud.points, scene_unit=1.0), statistical).registration
     shown = seen_points(truth, cloud, 1.0)
     exact = RegistrationErrors.of(replace(found, material=truth), truth, shown, 1.0)
     assert exact.distances.max() == 0.0 and len(exact.distances) == len(truth) and 0 < exact.seen.sum() < len(truth)

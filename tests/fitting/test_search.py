@@ -26,7 +26,7 @@ from mereo.fitting.problem.evidence import (
 )
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import OPEN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm, Surface
+from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer_frame import check_size, search_modes
 from mereo.fitting.registration.register import CloudToFit
 from mereo.fitting.search import ALIKE, ROUNDS, WHOLE, SearchRound, SightTable, Trail, likelier, medoids, rotations
@@ -173,7 +173,7 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     points = cut(view(model, posed), share)[0]
     points = points * (1 + default_rng(0).normal(scale=0.5 / 150.0, size=(len(points), 1)))
     evidence = Evidence.of(points)
-    whole = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig()).with_noise(evidence.noise)
+    whole = Problem(model, evidence, OPEN_SCALE_STD, FitConfig()).with_noise(evidence.noise)
     partial = whole.changed(evidence=replace(evidence, other_lines="unknown"))
     trails = [
         Trail(each, handicap, [refined(each, fit_wide(each, posed))])
@@ -191,7 +191,7 @@ def test_a_noisy_frame_is_explained_where_neighbours_share_as_much_as_they_do_ar
     seen = points * (1 + (waves + rng.normal(scale=0.05, size=len(points)))[:, None] / 150.0)
     for share, is_explained in ((np.inf, False), (0.1, False), (0.5, True)):
         evidence = replace(Evidence.of(seen), shared_noise=SharedNoise(share))
-        problem = Problem(model, NetworkTerm.none(model), evidence, OPEN_SCALE_STD, FitConfig(), noise=0.5)
+        problem = Problem(model, evidence, OPEN_SCALE_STD, FitConfig(), noise=0.5)
         assert ScoredFit.of(problem, posed).explains(problem) is is_explained
 
 
@@ -200,7 +200,7 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
 ) -> None:
     """Those that differ, and not by a turn after which the object looks the same."""
     posed = state(model, 3)
-    problem = Problem(model, NetworkTerm.none(model), Evidence.of(view(model, posed)), OPEN_SCALE_STD, FitConfig())
+    problem = Problem(model, Evidence.of(view(model, posed)), OPEN_SCALE_STD, FitConfig())
     first = ScoredFit.of(problem, posed)
     turned = replace(posed, rotation=posed.rotation @ Rotation.from_euler("y", np.pi).as_matrix())
     others = [ScoredFit.of(problem, each) for each in (turned, posed)]

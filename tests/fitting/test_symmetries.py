@@ -6,7 +6,8 @@ from functools import cache
 import numpy as np
 import pytest
 import trimesh
-from fit_cases import IN_FRONT, said, seen
+from answers import fit_modes
+from fit_cases import IN_FRONT, seen
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -33,7 +34,6 @@ from mereo.fitting.draws.playback import Drawn, DrawnStates, material_moved
 from mereo.fitting.problem.evidence import OBSERVED_SAMPLES
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.segments import ANGLES, find_segment_turns, left_open
-from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.fitting.uncertainty import Posterior, covariance_factor
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import transform_points
@@ -170,9 +170,9 @@ def test_of_many_draws_those_jump_that_slide_along_the_surface() -> None:
     drawn = Drawn.of(scene, 1006)
     truth = drawn.z.copy()
     material = transform_points(IN_FRONT, material_moved(scene, model, drawn.deformations(scene, truth)))
-    fitted = ModesFit.of(CloudToFit(seen(model.mesh(material)), 1.0), said(model, material), model)
+    fitted = fit_modes(seen(model.mesh(material)), model, 1.0, material)
     config = replace(MANY_DRAWS, explained=0.01)
-    problem = DrawsProblem.of(fitted.problem, states, fitted.correspondences, config)
+    problem = DrawsProblem.of(fitted.problem, states, config)
     wrong = truth.copy()
     wrong[0] = ndtri((ndtr(truth[0]) + 1 / 6) % 1.0)
     start = descend(problem, simulate(problem, drawn, wrong, POSE), 1)
@@ -230,8 +230,8 @@ def moved(z: np.ndarray) -> np.ndarray:
 def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
     material = transform_points(IN_FRONT, moved(z))
     cloud = seen(model().mesh(material))
-    fitted = ModesFit.of(CloudToFit(cloud[:: max(1, len(cloud) // points)], 1.0), said(model(), material), model())
-    return DrawsProblem.of(fitted.problem, states(), fitted.correspondences)
+    fitted = fit_modes(cloud[:: max(1, len(cloud) // points)], model(), 1.0, material)
+    return DrawsProblem.of(fitted.problem, states())
 
 
 def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:

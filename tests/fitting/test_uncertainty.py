@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from answers import answer_to, fit_correspondences
-from fit_cases import SCENE, said, seen, shown
+from answers import answer_to, fit_cloud
+from fit_cases import SCENE, seen, shown
 from folder_contents import read_json
 from numpy.linalg import norm
 from numpy.random import default_rng
@@ -55,7 +55,7 @@ def material(model: StatisticalModel) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def found(model: StatisticalModel, material: np.ndarray) -> Registration:
-    registration = fit_correspondences(seen(model.mesh(material)), said(model, material), model, 1.0)
+    registration = fit_cloud(seen(model.mesh(material)), model, material)
     assert registration.method == "modes" and registration.explained > 0.95
     return registration
 
@@ -116,10 +116,9 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
 
 def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, sure: Uncertainty) -> None:
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
-    points, network = seen(model.mesh(material)), said(model, material)
+    points = seen(model.mesh(material))
     for unit in (0.001, 25.0):
-        other = replace(network, points=unit * network.points @ turn.T)
-        again = fit_correspondences(unit * points @ turn.T, other, model, unit)
+        again = fit_cloud(unit * points @ turn.T, model, material @ turn.T, unit)
         assert_allclose(again.uncertainty.material, unit * sure.material, rtol=0.02)
         for one, first in zip(again.uncertainty.segments, sure.segments, strict=True):
             assert one.centroid_radius95 == pytest.approx(unit * first.centroid_radius95, rel=0.02)

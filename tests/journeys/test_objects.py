@@ -109,7 +109,6 @@ def test_what_is_written_leaves_out_what_nobody_knows(found: mereo.Result, tmp_p
     summary = read_json(tmp_path / "out/summary.json")
     assert summary["weights"] is None and summary["registration"]["located_by"] == "search"
     assert [one["confidence"] for one in summary["segments"]] == [None, None] and "device" not in summary
-    assert summary["recognition"]["signs"]["displaced"] is None
     written = (tmp_path / "out/points.ply").read_bytes()
     assert b"label" in written and b"confidence" not in written and b"occupancy" not in written
 

@@ -19,7 +19,7 @@ from toy_scene import Lift, Shear, toy_scene
 
 from mereo.api.words import python_words
 from mereo.deformation.maps import Deformation
-from mereo.fitting.registration.register import CloudToFit, Registrar, fit_frame
+from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration, nearest_labels
 from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import Segment, SegmentedMesh
@@ -534,21 +534,6 @@ def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Pa
     assert list(volume.values.shape) == summary["carried"][3]["voxels"] and volume.values.dtype == np.int16
     together = read_segmented_mesh(out / "carried.glb")
     assert together.names[:2] == ("own.ply", "own.glb") and len(together.names) == 2 + len(summary["segments"])
-
-
-def test_a_wrong_unit_is_not_believed(weights: Model) -> None:
-    registrar, cloud = Registrar.of(weights, "modes"), load_view("rope").depth.to_points()
-    free = registrar.fit_modes(CloudToFit(cloud.points)).registration
-    metres, true = (registrar.stated_scene_unit(unit_m) for unit_m in (1.0, 0.01))
-    # the cloud is said to be in metres
-    wrong = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=metres, is_unit_certain=False)).registration
-    right = registrar.fit_modes(CloudToFit(cloud.points, scene_unit=true, is_unit_certain=False)).registration
-    assert_array_equal(wrong.material, free.material)
-    assert not wrong.unit_known and not free.unit_known
-    assert right.unit_known and right.scene_unit == pytest.approx(1.0, rel=1e-4)
-    stated = CloudToFit(cloud.points, scene_unit=0.95, is_unit_certain=False)
-    near = fit_frame(stated, weights, weights.statistical_model)
-    assert near.unit == 0.95  # within what the network's own estimate leaves open
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from fit_cases import IN_FRONT, said, seen
+from answers import fit_modes
+from fit_cases import IN_FRONT, seen
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
@@ -19,7 +20,6 @@ from mereo.fitting.draws.fit import redraw_choices
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.segments import Joints
-from mereo.fitting.registration.register import CloudToFit, ModesFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import transform_points, unit_rows
 from mereo.scenes.parameters import random_state
@@ -118,7 +118,7 @@ def test_a_choice_that_no_start_has_made_is_found() -> None:
     pushed = states_with(model, 1, 1).seeds[0]
     state = SCENE.deform(random_state(SCENE, pushed).deformations)
     material = transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
-    fitted = ModesFit.of(CloudToFit(seen(state.mesh.transformed(IN_FRONT)), 1.0), said(model, material), model)
+    fitted = fit_modes(seen(state.mesh.transformed(IN_FRONT)), model, 1.0, material)
     found = fitted.with_draws(states_with(model, 3, 16))
     assert found.method == "draws" and found.drawn is not None
     assert box_of(found.drawn) == 1

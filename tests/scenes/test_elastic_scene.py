@@ -18,7 +18,7 @@ from mereo.fitting.config import ELASTIC
 from mereo.fitting.problem.evidence import Directions, Evidence, signed
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import GivenPose, Problem
-from mereo.fitting.problem.residuals import NetworkTerm, Prior, SampledSurface
+from mereo.fitting.problem.residuals import Prior, SampledSurface
 from mereo.fitting.registration.answer_frame import initial_state, search_modes
 from mereo.fitting.registration.register import CloudToFit
 from mereo.geometry.mesh import SegmentedMesh
@@ -256,7 +256,7 @@ def test_a_given_pose_weighs_as_its_error_says(held: tuple[Scene, StatisticalMod
     _, model = held
     start = Posed(np.eye(3), np.array([0.0, 0.0, 120.0]), np.zeros(model.count))
     evidence = Evidence.of(seen(model.rest.transformed(rigid(np.eye(3), start.translation))))
-    problem = Problem(model, NetworkTerm.none(model), evidence, 1e-6, ELASTIC, given=GivenPose(start, 0.5))
+    problem = Problem(model, evidence, 1e-6, ELASTIC, given=GivenPose(start, 0.5))
     moved = Posed(np.eye(3), np.array([0.3, 0.0, 120.0]), np.zeros(model.count))
     prior = Prior.whole(model)
     gradient = problem.known(moved, prior, 0.0).gradient

@@ -1,14 +1,13 @@
-"""Answers to clouds, and registrations from given correspondences."""
+"""Answers to clouds, and registrations."""
 
 from typing import Any
 
 import numpy as np
 from numpy import ndarray
 
-from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.problem.correspondences import Correspondences
+from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer import Answer
-from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.answer_frame import answer_frame, search_modes
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
@@ -46,13 +45,13 @@ def reconstruct(
     return answer_to(points, model, None, resolution, axes, **options).reconstruction
 
 
-def fit_correspondences(
-    points: ndarray,
-    correspondences: Correspondences,
-    model: StatisticalModel,
-    scene_unit: float | None = None,
-    states: DrawnStates | None = None,
-) -> Registration:
-    """Registration of a cloud, with ``states`` by the scene's draws too."""
-    fitted = ModesFit.of(CloudToFit(points, scene_unit), correspondences, model)
-    return fitted.registration if states is None else fitted.with_draws(states)
+def fit_modes(points: ndarray, model: StatisticalModel, unit: float, material: ndarray) -> ModesFit:
+    """Fit of the modes from the mean state where a state's material points, in scene units, are."""
+    T, _ = model.project(material)
+    start = Posed(T[:3, :3], T[:3, 3], np.zeros(model.count))
+    return search_modes(CloudToFit(points, unit), model, starts=[start], rounds=())
+
+
+def fit_cloud(points: ndarray, model: StatisticalModel, material: ndarray, unit: float = 1.0) -> Registration:
+    """Registration of a cloud from there."""
+    return fit_modes(points, model, unit, material).registration

@@ -2,11 +2,9 @@
 
 import numpy as np
 from numpy import ndarray
-from numpy.random import default_rng
 from scipy.spatial.transform import Rotation
 from toy_scene import Lift, Shear, toy_scene
 
-from mereo.fitting.problem.correspondences import Correspondences
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
@@ -21,14 +19,6 @@ SCENE = toy_scene()
 
 IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matrix(), np.array([1.0, 2.0, 120.0]))
 """``T_camera_world`` of an object around the world's origin."""
-
-
-def said(model: StatisticalModel, material: ndarray, error: float = 0.5) -> Correspondences:
-    """What a network might say of a state: 200 material points, wrong by ``error`` units."""
-    rng = default_rng(0)
-    chosen = rng.choice(len(model.labels), 200, replace=False)
-    rest = model.rest_points[chosen] + rng.normal(scale=error, size=(200, 3))
-    return Correspondences(material[chosen], rest, model.labels[chosen], np.ones(200), np.arange(200) < 100)
 
 
 def seen(mesh: SegmentedMesh) -> ndarray:

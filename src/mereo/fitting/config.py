@@ -5,11 +5,11 @@ from typing import Literal
 
 AnswerMethod = Literal["auto", "network", "search", "modes", "full"]
 """Source of the answer to a frame: the registered model where that explains the frame, else the network; the network
-alone; the registered model in any case, found by a search without the network, or by its modes or the draws of its
-scene as well."""
+alone; the registered model in any case, the same, or by its modes alone, or by the draws of its scene in any case."""
 
 LocatedBy = Literal["search", "network", "pose"]
-"""What located the object in a frame: a search over poses and states, a trained network, or a pose that was given."""
+"""What located the object in a frame: a search over poses and states, a trained network, whose answer then it is, or a
+pose that was given."""
 
 Tracking = Literal["found", "followed", "lost"]
 """State of a tracked object in a frame: found by itself; followed from the last frame; or lost, so that its pose is
@@ -21,11 +21,9 @@ class FitConfig:
     """Constants of the fit; lengths are scene units if nothing else is stated.
 
     Attributes:
-        start_sigma: standard deviation of the network's correspondences, and the cloud's at first, as a share of half
-            the rest box's longest side.
+        start_sigma: the cloud's standard deviation at first, as a share of half the rest box's longest side.
         cloud_sigma: last standard deviation of the cloud, where its noise is not larger.
         cloud_weight: how many independent points the cloud is worth.
-        network_weight: the same of the correspondences, at the first and at the last step with the cloud.
         explained: the cloud's misfit, in squared standard deviations of a sample, above which other states are tried.
         unexplained: the same, above which a fit is likely wrong.
         samples: points of the surface that stand for it in most steps.
@@ -36,15 +34,12 @@ class FitConfig:
             single camera saw they are in any case.
         normal_length: distance, as a share of the same half, that a difference of unit normals by 1 is worth there in
             the search for the sample of each observed point.
-        retries: whether other states are tried, and a search is made, where a network's fit does not explain the frame.
         accepted, tolerance: a fit is believed where this share of the observed points lies as near its facing surface.
-            Where network and fit give .8 of the correspondences the same segment, a share of .85 is enough.
     """
 
     start_sigma: float = 0.06
     cloud_sigma: float = 0.2
     cloud_weight: float = 3000.0
-    network_weight: tuple[float, float] = (60.0, 10.0)
     explained: float = 0.147
     unexplained: float = 0.3
     samples: int = 3000
@@ -53,7 +48,6 @@ class FitConfig:
     exact_steps: int = 3
     by_normals: bool = False
     normal_length: float = 0.1
-    retries: bool = True
     accepted: float = 0.95
     tolerance: float = 0.45
 
@@ -66,11 +60,10 @@ class DrawsConfig:
         starts: random states, most like a shape, from which fits start.
         sieve: sets of differences spent on each start, and on how many of the best, one stage after the other.
         kept: how many of them are then fitted to the frame.
-        cloud_weight, network_weight: how many independent points cloud and correspondences are worth, from beginning
-            to end, also where draws and modes are compared.
+        cloud_weight: how many independent points the cloud is worth, also where draws and modes are compared.
         last_rounds: sets of differences in the fit to the frame; one after a jump.
         steps: at most with one set of differences.
-        explained: the cloud's misfit above which the network's answer is a start too, and draws may jump.
+        explained: the cloud's misfit above which draws may jump.
         hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
         passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
             draws fitted to that shape again.
@@ -80,7 +73,6 @@ class DrawsConfig:
         sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
         turned_worse: misfit by which a state may be worse with segments stiffly turned that look alike turned
             (``symmetric_groups``), for that shape to be tried.
-        network_start: whether the network's answer is a start too, where the cloud is not explained.
         every_point: whether the answer is fitted to every observed point in the end.
     """
 
@@ -88,7 +80,6 @@ class DrawsConfig:
     kept: int = 2
     sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
     cloud_weight: float = 1500.0
-    network_weight: float = 30.0
     last_rounds: int = 2
     steps: int = 6
     explained: float = 0.125
@@ -100,7 +91,6 @@ class DrawsConfig:
     jumps_kept: int | None = None
     sliding: float = 1.0
     turned_worse: float = 25.0
-    network_start: bool = True
     every_point: bool = True
 
 
@@ -113,7 +103,6 @@ What they are off by is shared by many points, so the cloud is worth fewer; expe
 
 MANY_DRAWS = DrawsConfig(
     cloud_weight=3000.0,
-    network_weight=10.0,
     batches=2,
     passes=1,
     starts=16,
@@ -123,7 +112,6 @@ MANY_DRAWS = DrawsConfig(
     jump_steps=12,
     jumps_kept=1,
     sliding=0.2,
-    network_start=False,
     every_point=False,
 )
 """Constants for scenes with more than ``FEW_DRAWS``: every set of differences plays each draw once."""
@@ -154,8 +142,6 @@ class TrackConfig:
             ``cooling`` in each step to that of the frame's noise.
         steps, exact_steps: steps on samples of the surface, and last ones on its faces.
         gate: distance from the expected surface beyond which a point is left out, as a share of the same half.
-        drop: share of the points by which a frame may be explained less than the best since the track began.
-        margin: share of the points that a frame's own fit must explain more than a lost track to take its place.
         least_area: share of the greatest area that was ever seen of the object, below which it is lost.
         most_ruled_out: share of the surface that the frame may rule out before the object is lost.
         scale_std: standard deviation of the scale's logarithm from frame to frame, where the unit is not known.
@@ -176,8 +162,6 @@ class TrackConfig:
     steps: int = 3
     exact_steps: int = 1
     gate: float = 0.25
-    drop: float = 0.05
-    margin: float = 0.02
     least_area: float = 0.15
     most_ruled_out: float = 0.3
     scale_std: float = 0.002

@@ -1,25 +1,21 @@
 """Fit pose and coefficients of the statistical model to a frame.
 
-1. From the mean state, the network's correspondences alone, from wide to narrow.
-2. Cloud, silhouette, free space, and less and less the correspondences.
-3. The same again under the Gaussian of the library's states near the answer: states lie on curved sets, of which it is
+1. Cloud, silhouette and free space, from wide to narrow.
+2. The same again under the Gaussian of the library's states near the answer: states lie on curved sets, of which it is
    the tangent.
-4. While the cloud is not explained, other states of the library and around the best fit, where the states lie on a
+3. While the cloud is not explained, other states of the library and around the best fit, where the states lie on a
    curved set at all.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mereo.fitting.problem.correspondences import Correspondences
-from mereo.fitting.problem.evidence import MOST_POINTS
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed
 from mereo.fitting.problem.problem import Misfit, Problem
-from mereo.fitting.problem.residuals import NetworkTerm, Prior, Surface
+from mereo.fitting.problem.residuals import Prior, Surface
 from mereo.fitting.problem.segments import (
     corner_positions,
     different,
@@ -27,20 +23,13 @@ from mereo.fitting.problem.segments import (
     largest_distance,
     rms_distance,
 )
-from mereo.geometry.downsampling import means_along_sight
-from mereo.geometry.surface_patches import smoothed
-from mereo.geometry.transforms import best_rotations, fit_rigid, robust_rigid
+from mereo.geometry.transforms import best_rotations, fit_rigid
 
 REFINE_SIGMA = 0.02
 """The cloud's first standard deviation in a refinement, as all sigmas of this module a share of ``half``."""
 
 PAIR_SLACK = 0.05
 """How far the kept distances may be off at first; it falls in each step."""
-
-
-def fit_modes(problem: Problem) -> "ScoredFit":
-    """Fit from the correspondences, refine, and try other states while the frame is not explained."""
-    return shaken(problem, explored(problem, refined(problem, fit_whole(problem))))
 
 
 def refined(problem: Problem, posed: Posed) -> "ScoredFit":
@@ -54,12 +43,12 @@ def has_many_optima(problem: Problem) -> bool:
 
 
 def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
-    """Try states that agree with a fit or the network, while the best does not explain the cloud."""
-    for number in range(2 * has_many_optima(problem)):
+    """Try states that agree with a fit in most points, while the best does not explain the cloud."""
+    for _ in range(2 * has_many_optima(problem)):
         if best.explains(problem):
             break
         before = best
-        for other in find_candidates(problem, best.posed, number):
+        for other in find_candidates(problem, best.posed):
             best = best.better(problem, refine(problem, other, 1.0, 8))
         if best is before:
             break
@@ -80,8 +69,8 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     What folds or has joints has many optima next to each other, and the right one is rarely far from a wrong one. Not
     where the unit is unknown: frames of other things are explained no less without it, and cost a third more with it.
     """
-    rng, is_patient = np.random.default_rng(0), problem.config.retries and not problem.is_scale_open
-    for _ in range(SHAKES * (is_patient and has_many_optima(problem))):
+    rng = np.random.default_rng(0)
+    for _ in range(SHAKES * (has_many_optima(problem) and not problem.is_scale_open)):
         is_over = best.explains(problem) or best.misfit.cloud > HOPELESS
         if is_over or (problem.is_noisy and problem.share_on(best.surface) < problem.accepted):
             break
@@ -109,7 +98,7 @@ def bend_by_few(problem: Problem, states: list[Posed], kept: int) -> list[tuple[
     coarse, whole, cost = problem.coarse, Prior.whole(problem.model), list[float]()
     for start, steps, sigma in BENDING:
         states = [fit_cloud(coarse, posed, whole, start, steps, PAIR_SLACK) for posed in states]
-        cost = [coarse.screen(posed, sigma * problem.model.half).without_network for posed in states]
+        cost = [coarse.screen(posed, sigma * problem.model.half).total for posed in states]
         order = np.argsort(cost)
         states, cost = [states[index] for index in order], [cost[index] for index in order]
         rows = differing(problem, states, BENT_APART)[: max(kept, len(states) // 2)]
@@ -148,12 +137,11 @@ class ScoredFit:
         return scored if scored.misfit.total < self.misfit.total else self
 
 
-def find_candidates(problem: Problem, best: Posed, number: int) -> list[Posed]:
+def find_candidates(problem: Problem, best: Posed) -> list[Posed]:
     """Find two other states that may explain the frame: screen by few points, refine a little, screen again."""
     coarse, sigma = problem.coarse, REFINE_SIGMA * problem.model.half
-    library = similar_states(problem, best, 12) + (states_like_network(problem, 2) if number == 0 else [])
     screened = list[Posed]()
-    for group in (library, problem.joints.others(best, 4)):
+    for group in (similar_states(problem, best, 12), problem.joints.others(best, 4)):
         screened += sorted(group, key=lambda other: coarse.screen(other, sigma).total)[:8]
     # those that differ from ``best`` and from all before them: from alike starts a fit ends alike
     drawn = [best, *(refine(coarse, other, 2.0, 4) for other in screened)]
@@ -161,16 +149,8 @@ def find_candidates(problem: Problem, best: Posed, number: int) -> list[Posed]:
     return sorted((drawn[row] for row in rows), key=lambda other: problem.screen(other, sigma).total)[:2]
 
 
-def fit_whole(problem: Problem) -> Posed:
-    """Fit stages 1 and 2 from the mean state, under the prior of all states."""
-    prior = Prior.whole(problem.model)
-    z = np.zeros(problem.model.count)
-    T = robust_rigid(problem.network.mean, problem.network.target, problem.network.confidence, problem.network_sigma)
-    return fit_wide(problem, fit_network(problem, Posed(T[:3, :3], T[:3, 3], z), prior))
-
-
 def fit_wide(problem: Problem, posed: Posed) -> Posed:
-    """Fit stage 2 from a state that may be far off, under the prior of all states."""
+    """Fit from a state that may be far off, under the prior of all states."""
     return fit_cloud(problem, posed, Prior.whole(problem.model), problem.config.start_sigma, 15, PAIR_SLACK)
 
 
@@ -180,34 +160,21 @@ def refine(problem: Problem, posed: Posed, widening: float = 1.0, steps: int = 1
     return fit_cloud(problem, posed, prior, widening * REFINE_SIGMA, steps, 0.0)
 
 
-def fit_network(problem: Problem, posed: Posed, prior: Prior) -> Posed:
-    """Fit the correspondences alone, from wide to narrow; robust from a third of the steps on."""
-    steps = 8
-    for step in range(steps):
-        sigma = problem.network_sigma * 2.5 ** (1.0 - step / (steps - 1))
-        normal = problem.known(posed, prior, PAIR_SLACK * problem.model.half)
-        normal = problem.network.add_to(normal, posed, sigma, 500.0, robust=3 * step >= steps)
-        posed = posed.moved(normal.step(DAMPING))
-    return posed
-
-
 def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps: int, slack: float) -> Posed:
     """Fit everything that the frame shows; ``start`` (the cloud's first sigma) and ``slack`` are shares of ``half``."""
     config, half = problem.config, problem.model.half
     for step in range(steps):
-        share = step / max(1, steps - 1)
         sigma = max(start * half * 0.75**step, problem.cloud_sigma)
-        weight = config.network_weight[0] * (1 - share) + config.network_weight[1] * share
         normal = problem.known(posed, prior, slack * half * 0.7**step)
         exact = steps - step <= config.exact_steps and sigma <= 2 * problem.cloud_sigma
-        posed = posed.moved(problem.seen(normal, posed, sigma, weight, exact).step(DAMPING))
+        posed = posed.moved(problem.seen(normal, posed, sigma, exact).step(DAMPING))
     return posed
 
 
 # --- states of the library from which a fit may start -----------------------------------------------------------------
 
 SEARCHED, FEWER = 700, 64
-"""States of the library that are compared, and correspondences or material points that rank them."""
+"""States of the library that are compared, and material points that rank them."""
 
 ALIKE = 0.03
 """Tolerance, of half the rest box's longest side: points nearer than this agree."""
@@ -232,21 +199,6 @@ def robust_poses(
     cost = squared / (sigma**2 + squared) @ (weight / weight.sum())
     translation = goal - np.matmul(center, rotation.transpose(0, 2, 1))
     return cost, rotation.astype(np.float64), translation[:, 0].astype(np.float64)
-
-
-def states_like_network(problem: Problem, count: int) -> list[Posed]:
-    """Return the states of the library that explain the correspondences best, posed on them."""
-    network, library = problem.network, problem.model.library
-    if len(network.target) == 0:
-        return []
-    few = np.arange(0, len(network.target), max(1, len(network.target) // FEWER))
-    library = library[:: max(1, len(library) // SEARCHED)]
-    motion = library @ network.modes[few].reshape(3 * len(few), library.shape[1]).T
-    states = network.mean[few].astype(np.float32) + motion.reshape(len(library), -1, 3)
-    target, weight = network.target[few].astype(np.float32), network.confidence[few].astype(np.float32)
-    cost, rotation, translation = robust_poses(states, target, weight, problem.network_sigma)
-    best = np.argsort(cost)[:count]
-    return [Posed(rotation[i], translation[i], library[i].astype(np.float64)) for i in best]
 
 
 def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
@@ -276,27 +228,27 @@ def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
 # prior is N(0, 1) each.
 
 
-def fit_rest(problem: Problem, correspondences: Correspondences, modes: Posed) -> ScoredFit:
+def fit_rest(problem: Problem, modes: Posed) -> ScoredFit:
     """Fit the rest model's pose from that of the modes; its ``posed.z`` is empty."""
-    model, rest = problem.model, of_rest(problem, correspondences)
+    model, rest = problem.model, of_rest(problem)
     T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
     return lowered(rest, fit_cloud(rest, start, Prior.whole(rest.model), REFINE_SIGMA, 10, 0.0))
 
 
-def of_rest(problem: Problem, correspondences: Correspondences) -> Problem:
+def of_rest(problem: Problem) -> Problem:
     """Return the problem of the rest model's pose alone."""
     model = problem.model
     rigid = model.around(model.rest_points, np.zeros((len(model.rest_points), 3, 0), dtype=np.float32))
-    return replace(problem, model=rigid, network=NetworkTerm.of(rigid, correspondences))
+    return replace(problem, model=rigid)
 
 
-def resting(problem: Problem, correspondences: Correspondences, modes: ScoredFit) -> ScoredFit | None:
+def resting(problem: Problem, modes: ScoredFit) -> ScoredFit | None:
     """Fit of the rest model where its evidence is greater than that of the modes; a rigid object is always at rest.
 
     None where the rest pose is none of the object's states.
     """
-    rest, model = fit_rest(problem, correspondences, modes.posed), problem.model
+    rest, model = fit_rest(problem, modes.posed), problem.model
     is_rigid = model.count == 0
     is_better = is_rigid or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
     return rest if model.rests and is_better else None
@@ -304,40 +256,11 @@ def resting(problem: Problem, correspondences: Correspondences, modes: ScoredFit
 
 def narrowing(problem: Problem, modes: Posed) -> float:
     """``NormalEquations.narrowing`` of the modes at a state."""
-    known, config = problem.known(modes, Prior.whole(problem.model), 0.0), problem.config
-    return problem.seen(known, modes, problem.cloud_sigma, config.network_weight[1], True).narrowing()
+    known = problem.known(modes, Prior.whole(problem.model), 0.0)
+    return problem.seen(known, modes, problem.cloud_sigma, True).narrowing()
 
 
 # --- noisy frames -----------------------------------------------------------------------------------------------------
-
-PredictCorrespondences = Callable[[Float[np.ndarray, "n 3"]], Correspondences]
-"""Predicts correspondences of points of the camera frame, in their unit."""
-
-NetworkFit = tuple[Problem, Correspondences, ScoredFit]
-"""A frame, the network's correspondences, and the fit to both."""
-
-
-def fit_seen(
-    problem: Problem,
-    correspondences: Correspondences,
-    points: Float[np.ndarray, "n 3"],
-    predict: PredictCorrespondences | None,
-) -> NetworkFit:
-    """Fit a frame from the correspondences.
-
-    Of a noisy one the network also sees the smoothed cloud, and the better fit is taken, and fitted once more by every
-    point with the noise that it leaves over. ``points`` are in scene units.
-    """
-    fits = [(problem, correspondences, fit_modes(problem))]
-    if problem.is_noisy and predict is not None:
-        other = predict(smoothed(means_along_sight(points, MOST_POINTS)))
-        again = problem.changed(network=NetworkTerm.of(problem.model, other))
-        fits.append((again, other, fit_modes(again)))
-    problem, correspondences, best = min(fits, key=lambda fit: fit[2].misfit.without_network)
-    if problem.is_noisy:
-        problem = problem.quieted(problem.left_noise(best.surface))
-        best = refined(problem, best.posed)
-    return problem, correspondences, best
 
 
 def settled(problem: Problem, posed: Posed) -> ScoredFit:
@@ -359,12 +282,11 @@ GAIN = 1.0
 def lowered(problem: Problem, posed: Posed) -> ScoredFit:
     """Descend by steps that lower the misfit (Levenberg and Marquardt)."""
     best, prior = ScoredFit.of(problem, posed), Prior.whole(problem.model)
-    sigma, weight = problem.cloud_sigma, problem.config.network_weight[1]
     for damping in (DAMPING, 30.0 * DAMPING):
         gain = np.inf
         while gain > GAIN:
             known = problem.known(best.posed, prior, 0.0)
-            normal = best.problem.seen(known, best.posed, sigma, weight, True, best.surface)
+            normal = best.problem.seen(known, best.posed, problem.cloud_sigma, True, best.surface)
             other = ScoredFit.of(problem, best.posed.moved(normal.step(damping)))
             gain = best.misfit.total - other.misfit.total
             best = min(best, other, key=lambda fit: fit.misfit.total)

@@ -1,4 +1,4 @@
-"""Search for the pose and the state of an object in a frame, without a network.
+"""Search for the pose and the state of an object in a frame.
 
     cloud, lines of sight, statistical model -search-> the state that explains the frame, and how many explain it alike
 
@@ -615,7 +615,7 @@ def search(
     starts: Sequence[Posed] = (),
     rounds: Sequence[SearchRound] = ROUNDS,
 ) -> Trail:
-    """Search for the state that explains a frame without correspondences, or fit it from ``starts``.
+    """Search for the state that explains a frame, first from ``starts``, then in rounds.
 
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
@@ -625,7 +625,8 @@ def search(
         for trail in trails:
             trail.fitted += [refined(trail.problem, fit_wide(trail.problem, start)) for start in starts]
         chosen = likelier(with_left_noise(trails))
-        return chosen.with_heavier_cloud() or chosen.with_shared_noise()
+        if not rounds or chosen.is_explained:
+            return chosen.with_heavier_cloud() or chosen.with_shared_noise()
     for stage in rounds:
         for trail in trails:
             trail.go_on(stage)

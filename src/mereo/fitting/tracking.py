@@ -1,11 +1,10 @@
-"""Follow an object from frame to frame: each fit starts where the last ended; network or search find a lost object.
+"""Follow an object from frame to frame: each fit starts where the last ended; a search finds a lost object.
 
     Observation, time -Tracker.follow-> Answer (found, followed or lost)
 
 An object is lost where few points lie near where it was expected, the model explains fewer of them than it must, or the
-frame rules out much of it. Then, and at first, a network fits the frame by itself, and the better of both is continued.
-Where that explains nothing, or there is no network, the answer says so, and a search goes on in the background; its
-state, fitted to the newest frame, begins a new track.
+frame rules out much of it. Then the answer says so, and a search goes on in the background; its state, fitted to the
+newest frame, begins a new track. The first frame waits for its search.
 """
 
 import time
@@ -23,10 +22,9 @@ from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig, LocatedBy, TrackConfig, Tracking
 from mereo.fitting.modes import ScoredFit, explored, has_many_optima, refine
-from mereo.fitting.problem.correspondences import nothing
 from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.problem.residuals import NetworkTerm, Prior, are_near
+from mereo.fitting.problem.residuals import Prior, are_near
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
 from mereo.fitting.registration.recognition import MOST, Recognition, recognize
@@ -50,7 +48,7 @@ class Track:
     """State of an object at a time, from which the next frame is fitted.
 
     Attributes:
-        problem: of that frame, without correspondences: the model, and the frames' noise, smoothed.
+        problem: of that frame: the model, and the frames' noise, smoothed.
         unit: length of a scene unit in the clouds' unit.
         posed: the state, scene units, without a scale.
         velocity: of the parameters, in the order of ``gauss_newton``, a second.
@@ -79,9 +77,7 @@ class Track:
         base, model = fitted.problem, fitted.problem.model
         scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
         return cls(
-            problem=base.changed(network=NetworkTerm.none(model), scale_std=scale_std, config=constants).with_noise(
-                base.left_noise(fitted.surface)
-            ),
+            problem=base.changed(scale_std=scale_std, config=constants).with_noise(base.left_noise(fitted.surface)),
             unit=fitted.unit * scale,
             posed=posed,
             time_s=time_s,
@@ -150,7 +146,7 @@ def next_fit(
             evidence = like.evidence(track.unit, config.observed_samples, config.points)
             problem = track.problem.changed(evidence=evidence)
             posed = descend(problem, start, precision, config)
-            return ModesFit(problem, nothing(), track.unit, posed, 0.0, calibration=track.calibration)
+            return ModesFit(problem, track.unit, posed, 0.0, calibration=track.calibration)
 
         fitted = fit(lines.other_lines or track.other_lines)
         if lines.other_lines is None and fitted.problem.silhouette_misfit(fitted.surface) > WHOLE:
@@ -223,7 +219,7 @@ def descend(problem: Problem, start: Posed, precision: Float[np.ndarray, "p p"],
         sigma = max(config.first_sigma * half * config.cooling**step, problem.cloud_sigma)
         expected = NormalEquations(precision, precision @ between(start, posed))
         normal = problem.known(posed, prior, 0.0).plus(expected)
-        normal = problem.seen(normal, posed, sigma, 0.0, exact=step >= config.steps)
+        normal = problem.seen(normal, posed, sigma, exact=step >= config.steps)
         posed = posed.moved(normal.step(DAMPING))
     return posed
 
@@ -334,14 +330,12 @@ class Tracker:
         """Follow an object.
 
         Args:
-            registrar: of the object; its ``method`` says whether a registration that does not explain its frame is
-                taken.
+            registrar: of the object.
             config: constants.
             executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
             search: what finds it; None is ``search_hypotheses``.
         """
-        # a frame that nothing explains comes 30 times a second while the object is away
-        self.registrar = registrar.without_retries
+        self.registrar = registrar
         self.config = config
         self._search = BackgroundSearch(registrar, executor, search)
         self.forget()
@@ -357,8 +351,7 @@ class Tracker:
         self._search.close(wait=False)
         self._track: Track | None = None
         self._T_camera_input, self._axes = np.eye(4), "camera"
-        self._best = 0.0
-        self._located_by: LocatedBy = "network"
+        self._located_by: LocatedBy = "search"
         self._has_begun = False
 
     def close(self) -> None:
@@ -382,11 +375,11 @@ class Tracker:
         """
         started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all)
         tracked, why = self._tracked(self._track, frame, self.config.longest_s)
-        if tracked is not None and self._is_believed(tracked):
+        if tracked is not None and not self._doubt(tracked):
             return self._gone_on(frame, tracked, started)
         alone = None
-        if self._is_fitted_alone(seen):
-            alone = self._by_itself(frame, tracked, started)
+        if not self._has_begun:
+            alone = self._by_itself(frame, started)
             if alone.tracking != "lost":
                 return alone
         again = self._searched(frame)
@@ -396,10 +389,6 @@ class Tracker:
         if again is not None:
             return self._gone_on(frame, again, started, "found")
         return self._lost(frame, alone, why if tracked is None else self._doubt(tracked), started)
-
-    def _is_fitted_alone(self, seen: Observation) -> bool:
-        """Whether a frame that no track leads to is fitted by itself at once: the first is, and all by a network."""
-        return self.registrar.asks_network or not self._has_begun
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> "tuple[_Tracked | None, str]":
         """Fit the frame from an earlier state; None, and why, without one that leads to it."""
@@ -422,7 +411,7 @@ class Tracker:
             return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
         tracked = fit(self.config)
-        if not tracked.fitted.registration.accepted and not self.registrar.asks_network:  # it may have moved far
+        if not tracked.fitted.registration.accepted:  # it may have moved far
             tracked = max(tracked, fit(self.config.patient), key=lambda fit_: fit_.score)
         return tracked, ""
 
@@ -436,7 +425,7 @@ class Tracker:
         begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar.config)
         area = 0.0 if self._track is None else self._track.area
         tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
-        if tracked is not None and self._takes(tracked):
+        if tracked is not None and not self._doubt(tracked):
             self._located_by = "search"
             return tracked
         self._T_camera_input, self._axes = before
@@ -447,43 +436,24 @@ class Tracker:
         network = self.registrar.network
         return frame.seen, *find(frame.seen, network, self.registrar, frame.keep_all, frame.scene_unit)
 
-    def _by_itself(self, frame: TrackedFrame, tracked: "_Tracked | None", started: float) -> Answer:
-        """Answer a frame by itself, which begins a track, or by the track that went on, where that is better.
-
-        The object is lost where neither explains the frame, and then the track is kept.
-        """
+    def _by_itself(self, frame: TrackedFrame, started: float) -> Answer:
+        """Answer a frame by itself, which begins a track; the object is lost where nothing explains it."""
         registrar, config = self.registrar, self.config
         seen, candidate, likelier = self._locate(frame)
         must_register = registrar.method != "auto" or registrar.network is None
-        if candidate.error is not None and tracked is None and must_register:
+        if candidate.error is not None and must_register:
             raise candidate.error
         self._has_begun, alone = True, None
         if candidate.modes is not None:
             alone = _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
-        is_better = tracked is not None and (alone is None or alone.score <= tracked.score + config.margin)
-        if tracked is not None and is_better and self._takes(tracked):
-            return self._gone_on(frame, tracked, started, restart=True)
-        if alone is None or not self._takes(alone):
+        if alone is None or self._doubt(alone):
             registration = None if alone is None else alone.fitted.registration
             answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
             return replace(answer, registrar=registrar, tracking="lost")
-        self._search.drop()
-        self._track, self._best, self._located_by = alone.track, alone.score, candidate.located_by
+        self._track, self._located_by = alone.track, candidate.located_by
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, seen.frame.axes
         answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.fitted.registration)
         return replace(answer, seconds=time.perf_counter() - started)
-
-    def _is_believed(self, tracked: "_Tracked") -> bool:
-        """Whether the frame need not be fitted by itself."""
-        if not self._takes(tracked):
-            return False
-        return not self.registrar.asks_network or tracked.score >= self._best - self.config.drop
-
-    def _takes(self, candidate: "_Tracked") -> bool:
-        """Whether a fit is the answer to a frame; with "modes" any is."""
-        if not self.registrar.takes(candidate.fitted.registration):
-            return False
-        return self.registrar.method == "modes" or not self._doubt(candidate)
 
     def _doubt(self, tracked: "_Tracked") -> str:
         """What speaks against a fit, by the frame alone, in a clause; "" where nothing does."""
@@ -497,16 +467,10 @@ class Tracker:
         return ""
 
     def _gone_on(
-        self,
-        frame: TrackedFrame,
-        tracked: "_Tracked",
-        started: float,
-        tracking: Tracking = "followed",
-        restart: bool = False,
+        self, frame: TrackedFrame, tracked: "_Tracked", started: float, tracking: Tracking = "followed"
     ) -> Answer:
         """Answer a frame by a fit that an earlier frame's state led to."""
         self._track = tracked.track
-        self._best = tracked.score if restart or tracking == "found" else max(self._best, tracked.score)
         self._search.drop()
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)

@@ -247,14 +247,11 @@ class ModesOptimum:
     @cached_property
     def terms(self) -> Terms:
         """Terms under the prior of all states; that of states near the answer is too sure (docs/registration.md)."""
-        problem, posed, config = self.problem, self.posed, self.problem.config
+        problem, posed = self.problem, self.posed
         nothing = NormalEquations.nothing(POSE + len(posed.z))
         with limit_blas_threads():
             return Terms(
                 known=problem.known(posed, Prior.whole(problem.model), 0.0),
-                network=problem.network.add_to(
-                    nothing, posed, problem.network_sigma, config.network_weight[1], robust=True
-                ),
                 cloud=problem.cloud_rows(posed),
                 observed_samples=problem.evidence.observed_samples,
                 ruled_out=problem.add_silhouette(nothing, posed, problem.samples.posed(posed), problem.cloud_sigma),
@@ -343,9 +340,9 @@ Optimum = ModesOptimum | DrawsOptimum
 # Notation: n observed samples, p parameters, J_i and w_i derivatives and weight of an observed sample's residual. Where
 # neighbours share errors, its ``pull`` stands for w_i J_i.
 
-Evidence = Literal["points", "network", "silhouette", "states"]
-"""What leaves a position unsure by its errors: the observed points, the network's correspondences, what the frame
-rules out, and what was known of the object's states before the frame was seen."""
+Evidence = Literal["points", "silhouette", "states"]
+"""What leaves a position unsure by its errors: the observed points, what the frame rules out, and what was known of the
+object's states before the frame was seen."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -510,7 +507,6 @@ class Uncertainty:
         terms, factor = self.optimum.terms, self.posterior.factor
         jacobian, _, weight, nuisance = terms.cloud
         others: dict[Evidence, Float[np.ndarray, "p p"]] = {
-            "network": terms.network.matrix,
             "silhouette": terms.ruled_out.matrix,
             "states": terms.known.matrix,
         }

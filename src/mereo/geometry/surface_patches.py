@@ -10,7 +10,7 @@ Notation: n points, k neighbours.
 from math import nan
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from numpy import ndarray
 from numpy.linalg import norm, solve
 from scipy.spatial import cKDTree
@@ -104,39 +104,13 @@ def without_strays(points: Points) -> Flags:
     return keep
 
 
-# --- smoothing --------------------------------------------------------------------------------------------------------
+# --- noise of a cloud -------------------------------------------------------------------------------------------------
 
-# Local polynomial regression: what neighbours on the same surface have in common, evaluated at each point's own line of
-# sight. The inverse of the range is fitted, which for a plane is linear in the direction, so that slanted planes stay
-# as they are; squares follow the curvature. Notation: n points, k neighbours.
+# Local polynomial regression: what is left over of a quadratic patch. Of a camera's points the inverse of the range is
+# fitted, which for a plane is linear in the direction. Notation: n points, k neighbours.
 
-SIGHT_NEIGHBORS, RADIUS, WIDTH = 36, 3.2, 0.6
-"""Neighbours that are looked at, in an image nearly the 7 x 7 pixels around one; how far they may be, in pitches of the
-lines of sight; and the standard deviation of their weights, in radii."""
-
-RIDGE = (0.0, 0.02, 0.02, 0.1, 0.1, 0.1)
-"""Pull of the coefficients of (1, u, v, u^2, uv, v^2) towards 0, in neighbours: few of them carry no curvature."""
-
-FEWEST = 4
-"""A point with fewer neighbours on its surface, itself among them, stays where it is."""
-
-
-def smoothed(points: Points) -> Points:
-    """Points moved along their lines of sight, from the origin, to where their neighbours on the surface say it is."""
-    if len(points) < FEWEST:
-        return points
-    distance = norm(points, axis=1)
-    sight = points / distance[:, None]
-    angle, neighbor = cKDTree(sight).query(sight, k=min(SIGHT_NEIGHBORS + 1, len(points)))
-    radius = RADIUS * float(np.median(angle[:, FEWEST]))
-    if radius == 0:
-        return points
-    near = (angle <= radius) & _on_same_surface(distance, angle, neighbor)
-    weight = near * np.exp(-0.5 * (angle / (WIDTH * radius)) ** 2)
-    inverse = _fit_patches(_quadratic(sight, sight, neighbor, radius), weight, weight / distance[neighbor], RIDGE)[:, 0]
-    moved = np.where((near.sum(axis=1) >= FEWEST) & (inverse > 0), 1.0 / inverse, distance)
-    return sight * moved[:, None]
-
+TERMS = 6
+"""Coefficients of a patch: those of (1, u, v, u^2, uv, v^2)."""
 
 ROUGH_NEIGHBORS, CALM = 12, 0.1
 """Points of each local patch, itself among them, and the share of a cloud that is its calmest part."""
@@ -150,7 +124,7 @@ def roughness(points: Points, normals: Points | None = None) -> float:
     Infinite for fewer points than say anything.
     """
     count = min(ROUGH_NEIGHBORS, len(points))
-    free = count - len(RIDGE)
+    free = count - TERMS
     if free < 1:
         return float("inf")
     distance = norm(points, axis=1)
@@ -163,29 +137,10 @@ def roughness(points: Points, normals: Points | None = None) -> float:
         value = np.einsum("nki,ni->nk", points[neighbor] - points[:, None], normals)
         unit = np.ones(len(points))
     terms = _quadratic(places, axis, neighbor, radius)
-    patch = _fit_patches(terms, np.ones_like(value), value, (1e-6,) * len(RIDGE))  # rows of points leave it open
-    away = norm(value - np.einsum("nki,ni->nk", terms, patch), axis=1) * unit
+    normal = np.einsum("nki,nkj->nij", terms, terms) + 1e-6 * np.eye(TERMS)  # rows of points leave it open
+    patch = solve(normal, np.einsum("nki,nk->ni", terms, value)[..., None])
+    away = norm(value - np.matmul(terms, patch)[..., 0], axis=1) * unit
     return float(np.quantile(away, CALM)) / float(np.sqrt(free))
-
-
-def _on_same_surface(
-    distance: Values, angle: Float[ndarray, "n k"], neighbor: Int[ndarray, "n k"]
-) -> Bool[ndarray, "n k"]:
-    """Whether the step in range to each neighbour is no larger than slant or noise make it."""
-    step = np.abs(distance[neighbor] - distance[:, None])
-    noise = NOISE * float(np.median(step[:, 1 : FEWEST + 1]))
-    return step <= np.maximum(JUMP * angle * distance[:, None], noise)
-
-
-def _fit_patches(
-    terms: Float[ndarray, "n k 6"],
-    weight: Float[ndarray, "n k"],
-    weighted: Float[ndarray, "n k"],
-    ridge: tuple[float, ...],
-) -> Float[ndarray, "n 6"]:
-    """Coefficients of each point's patch by least squares; ``weighted`` are the neighbours' values times weights."""
-    normal = np.einsum("nki,nk,nkj->nij", terms, weight, terms) + np.diag(ridge)
-    return solve(normal, np.einsum("nki,nk->ni", terms, weighted)[..., None])[..., 0]
 
 
 def _quadratic(places: Points, axis: Points, neighbor: Int[ndarray, "n k"], radius: float) -> Float[ndarray, "n k 6"]:

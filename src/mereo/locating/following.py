@@ -47,14 +47,10 @@ class Tracker(tracking.Tracker):
         seen = replace(seen, point=None) if self._has_begun else at_point(seen, self.registrar)
         return super().follow(seen, time_s, scene_unit=scene_unit, keep_all=keep_all)
 
-    def _is_fitted_alone(self, seen: Observation) -> bool:
-        # to look through a whole frame takes seconds, which frames of a lost object do not wait for
-        return not self._has_begun if is_whole(seen, self.registrar) else super()._is_fitted_alone(seen)
-
     def _locate(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
         if not is_whole(frame.seen, self.registrar):
             return super()._locate(frame)
-        seen, candidate = locate_object(frame.seen, self._search.registrar, frame.keep_all, frame.scene_unit)
+        seen, candidate = locate_object(frame.seen, self.registrar, frame.keep_all, frame.scene_unit)
         return seen, candidate, candidate.encoded
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:

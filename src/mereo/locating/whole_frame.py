@@ -14,10 +14,8 @@ from jaxtyping import Bool
 from scipy.spatial import ConvexHull, cKDTree
 
 from mereo.fitting.modes import bend_by_few, fit_wide, refined
-from mereo.fitting.problem.correspondences import NoFit
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import NetworkTerm
+from mereo.fitting.problem.problem import NoFit, Problem
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import (
     answer_candidate,
@@ -174,8 +172,7 @@ class WholeFrame:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
         frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
         cloud, registrar = cloud_to_fit(frame, seen.lines, self.unit), self.registrar
-        evidence, nothing = cloud.evidence(self.unit), NetworkTerm.none(registrar.model)
-        return Problem(registrar.model, nothing, evidence, cloud.scale_std, registrar.config)
+        return Problem(registrar.model, cloud.evidence(self.unit), cloud.scale_std, registrar.config)
 
     def place(self, mask: Bool[np.ndarray, "h w"], states: Sequence[Posed]) -> Place:
         """Place of some states."""
@@ -242,7 +239,7 @@ class WholeFrame:
         registrar = self.registrar
         try:
             seen = self.chosen(place)
-            encoded = encode_frame(seen.readings(keep_all)[0], model, seen.frame.axes)
+            encoded = encode_frame(seen.readings(keep_all)[0], None, seen.frame.axes)
             states = () if rounds else place.states
             candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds)
         except ValueError:

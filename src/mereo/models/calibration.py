@@ -1,16 +1,12 @@
 """Calibration of weights: what was measured, on training seeds, of how far their answers can be trusted."""
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 from pydantic import BaseModel, Field, FiniteFloat
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
-
-
-SignName = Literal["size", "unexplained", "ruled_out", "beyond", "unusual", "displaced", "unseen"]
-"""Signs that a frame does not show the object in a state that was learned; ``fitting.registration`` tells them."""
 
 
 class Usual(BaseModel, frozen=True):
@@ -26,10 +22,12 @@ class Recognizing(BaseModel, frozen=True):
     Attributes:
         clean: usual signs of views without noise beyond the paper's.
         noisy: the same of simulated depth cameras' views.
+
+    Weights may have more signs than are asked.
     """
 
-    clean: dict[SignName, Usual]
-    noisy: dict[SignName, Usual]
+    clean: dict[str, Usual]
+    noisy: dict[str, Usual]
 
 
 MISFITTING = 2.0

@@ -6,7 +6,7 @@ modes, with the same residuals. The scene is played with the draws that fit best
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import lru_cache
 
 import igl
 import numpy as np
@@ -28,12 +28,10 @@ from mereo.fitting.draws.playback import (
     shares_of,
 )
 from mereo.fitting.modes import refine, robust_poses
-from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import (
     ROBUST,
-    NetworkTerm,
     Surface,
     Terms,
     add_silhouette,
@@ -58,14 +56,11 @@ class DrawsProblem:
 
     Attributes:
         base: the same frame, explained by modes, with the weights that the draws are fitted by.
-        correspondences, weights: of the network, scene units, and how their rest positions follow the material points.
         by_sight: whether observed points are compared with what their lines of sight meet, or with the nearest points.
     """
 
     base: Problem
     states: DrawnStates
-    correspondences: Correspondences
-    weights: PointWeights
     config: DrawsConfig
     by_sight: bool = False
 
@@ -80,27 +75,12 @@ class DrawsProblem:
         return self.base.by_every_point if self.config.every_point else self.base
 
     @classmethod
-    def of(
-        cls, base: Problem, states: DrawnStates, correspondences: Correspondences, config: DrawsConfig | None = None
-    ) -> "DrawsProblem":
+    def of(cls, base: Problem, states: DrawnStates, config: DrawsConfig | None = None) -> "DrawsProblem":
         """Problem with the constants for as many draws as the scene has, where none are given."""
         if config is None:
             config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
-        network_weight = config.network_weight, config.network_weight
-        fit_config = replace(base.config, cloud_weight=config.cloud_weight, network_weight=network_weight)
-        weights = base.model.weights(correspondences.rest, correspondences.labels)
-        return cls(replace(base, config=fit_config), states, correspondences, weights, config)
-
-    def network(self, fit: "DrawsFit", modes: Float32[np.ndarray, "n 3 d"] | None = None) -> NetworkTerm:
-        """Correspondences in the neighbourhood of a state."""
-        matches = self.correspondences
-        modes = np.zeros((len(matches.labels), 3, 0), dtype=np.float32) if modes is None else modes
-        return NetworkTerm(matches.points, self.weights(fit.material), modes, matches.confidence)
-
-    @cached_property
-    def following_played(self) -> csr_array:
-        """How the rest positions of the correspondences follow the played points."""
-        return as_sparse(self.weights, len(self.model.rest_points)) @ self.states.played.spread
+        fit_config = replace(base.config, cloud_weight=config.cloud_weight)
+        return cls(replace(base, config=fit_config), states, config)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,10 +136,9 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     """Misfit as ``Problem.misfit`` counts it, by any sigma of the cloud, without looking for observed samples again."""
     base = fit.base
     cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
-    network = base.config.network_weight[1] * problem.network(fit).energy(fit.posed, base.network_sigma)
     losses = silhouette_losses(fit.surface.material[base.model.silhouette_vertices], base.evidence, sigma)
     outside = base.config.silhouette_weight * float(losses.sum())
-    return cloud + network + outside + float(fit.z @ fit.z) + base.evidence.shared_errors.square
+    return cloud + outside + float(fit.z @ fit.z) + base.evidence.shared_errors.square
 
 
 def by_misfit(state: "DrawsFit | StateOnShape") -> float:
@@ -186,15 +165,12 @@ def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3
     corners = surface.model.faces[surface.facing[fit.face]]
     within = PointWeights(corners, barycentric(surface.material[corners], fit.position))
     planes = fit.position, surface.normals[fit.face], modes_of(as_sparse(within, spread.shape[0]) @ spread)
-    nothing, state = NormalEquations.nothing(POSE + count), replace(posed, z=np.zeros(count))
-    network = problem.network(fit, modes_of(problem.following_played))
     return Terms(
         known=prior_of_draws(fit.z, motion, posed.log_scale, base.scale_std),
-        network=network.add_to(nothing, state, base.network_sigma, config.network_weight[1], robust=True),
         cloud=cloud_rows(posed, samples, planes, sigma, config.cloud_weight, base.evidence.sample_errors, base.alike),
         observed_samples=samples,
         ruled_out=add_silhouette(
-            nothing,
+            NormalEquations.nothing(POSE + count),
             posed,
             surface.material[vertices],
             lambda rows: modes_of(spread[vertices[rows]]),
@@ -269,41 +245,21 @@ ENOUGH = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """Shape to be met: positions of some points, in any pose, with their standard deviation.
+    """Shape to be met: positions of the played points, in any pose, with their standard deviation.
 
     Attributes:
-        weight: inverse variances, together worth as many points as the shape is.
-        follow: how the points follow the played points of a state; they are these where None.
+        weight: inverse variance of a point: together they are worth as many as ``SHAPE_WEIGHT``.
     """
 
-    points: Float[np.ndarray, "n 3"]
+    points: Float[np.ndarray, "a 3"]
     std: float
-    weight: Float[np.ndarray, " n"]
-    follow: csr_array | None = None
-
-    @classmethod
-    def of(
-        cls,
-        points: Float[np.ndarray, "n 3"],
-        std: float,
-        confidence: Float[np.ndarray, " n"],
-        follow: csr_array | None = None,
-    ) -> "Shape":
-        """Shape worth ``SHAPE_WEIGHT`` points."""
-        return cls(points, std, confidence / confidence.sum() * (SHAPE_WEIGHT / std**2), follow)
+    weight: float
 
     @classmethod
     def of_material(cls, problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> "Shape":
         """Shape of material points, unposed: dense and smooth."""
-        few = problem.states.played.index
-        return cls.of(material[few], 0.04 * problem.model.half, np.ones(len(few)))
-
-    def at(self, values: Float[np.ndarray, "a *c"]) -> Float[np.ndarray, "n *c"]:
-        """Values at the points, from values at the played points."""
-        if self.follow is None:
-            return values
-        result: np.ndarray = self.follow @ values.reshape(len(values), -1)
-        return result.reshape(-1, *values.shape[1:])
+        points, std = material[problem.states.played.index], 0.04 * problem.model.half
+        return cls(points, std, SHAPE_WEIGHT / (len(points) * std**2))
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,18 +288,18 @@ def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.nd
     deformations = drawn.deformations(states.scene, z)
     if deformations is None:
         return None
-    positions = states.played.moved(deformations)
-    points, weight = shape.at(positions), shape.weight
+    points = states.played.moved(deformations)
+    weight = np.ones(len(points))
     for _ in range(3):
         share = weight / weight.sum()
         center, goal = share @ points, share @ shape.points
         rotation = best_rotations(((points - center) * share[:, None]).T @ (shape.points - goal))
         translation = goal - rotation @ center
         distance = np.linalg.norm(points @ rotation.T + translation - shape.points, axis=1)
-        weight = shape.weight * geman_mcclure(distance, ROBUST * max(shape.std, float(np.median(distance))))
+        weight = geman_mcclure(distance, ROBUST * max(shape.std, float(np.median(distance))))
     squared = distance**2
-    apart = float(shape.weight @ (squared / (1.0 + squared / (2 * ROBUST * shape.std) ** 2)))
-    return StateOnShape(drawn, z, positions, rotation, translation, apart + float(z @ z))
+    apart = shape.weight * float((squared / (1.0 + squared / (2 * ROBUST * shape.std) ** 2)).sum())
+    return StateOnShape(drawn, z, points, rotation, translation, apart + float(z @ z))
 
 
 def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int) -> StateOnShape:
@@ -368,12 +324,12 @@ def _step(
 ) -> tuple[StateOnShape, Float32[np.ndarray, "a 3 d"], float]:
     """Take Levenberg and Marquardt's step of the draws, the pose free; returns as ``lower`` does."""
     posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
-    points = posed.place(shape.at(state.points))
+    points = posed.place(state.points)
     offset = points - shape.points
     weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * ROBUST * shape.std)
     for _ in range(5):
         normal = prior_of_draws(state.z, motion, 0.0, 1e-6)
-        jacobian = in_space(posed, points, shape.at(motion))
+        jacobian = in_space(posed, points, motion)
         step = normal.add(jacobian, offset.ravel(), np.repeat(weight, 3)).step(damping)[POSE:]
         tried = lay_on_shape(states, shape, state.drawn, state.z + step)
         if tried is not None:
@@ -393,7 +349,7 @@ GAIN = 0.003
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """Fit the draws from several starts, and improve the best; None where the scene plays none of them back."""
     fits: list[DrawsFit] = []
-    for start in (fit_near_modes, *(fit_from_end,) * problem.config.passes, fit_like_network):
+    for start in (fit_near_modes, *(fit_from_end,) * problem.config.passes):
         fits += start(problem, modes, fits)
     best = min(fits, key=by_misfit, default=None)
     for improve in (try_symmetric_states, try_jumps, refine_by_sight):
@@ -447,16 +403,6 @@ def fit_from_end(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> l
     scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
     modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
     return fit_near_modes(problem, modes, fits, [replace(best.drawn, z=best.z)])
-
-
-def fit_like_network(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> list[DrawsFit]:
-    """Fit from states like the network's shape, if the cloud is not explained; a search has no correspondences."""
-    config, matches = problem.config, problem.correspondences
-    if not config.network_start or not len(matches.points) or explains_cloud(problem, fits, config.explained):
-        return []
-    camera = Posed(np.eye(3), np.zeros(3), np.empty(0), modes.log_scale)
-    points, sigma = matches.points * np.exp(-modes.log_scale), problem.base.network_sigma
-    return fit_from_shape(problem, camera, Shape.of(points, sigma, matches.confidence, problem.following_played), [])
 
 
 def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> bool:
@@ -514,11 +460,8 @@ def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
     states = problem.states
     some = spread(shape.points, 150)
     library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
-    if shape.follow is None:
-        compared = library[:, some]
-    else:
-        compared = np.stack([shape.follow[some] @ played for played in library])
-    cost = robust_poses(compared, goal, shape.weight[some].astype(np.float32), problem.base.network_sigma)[0]
+    equal = np.ones(len(some), dtype=np.float32)
+    cost = robust_poses(library[:, some], goal, equal, problem.base.first_sigma)[0]
     return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
 
 

@@ -10,7 +10,6 @@ from scipy.optimize import isotonic_regression
 from scipy.stats import norm
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import (
     MORE_SAMPLES,
     OBSERVED_SAMPLES,
@@ -30,7 +29,6 @@ from mereo.fitting.problem.gauss_newton import (
 from mereo.fitting.problem.residuals import (
     ROBUST,
     Met,
-    NetworkTerm,
     PairTerm,
     PosedSamples,
     Prior,
@@ -45,7 +43,7 @@ from mereo.fitting.problem.segments import Joints
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 COARSE = 3
-"""How many times fewer observed samples and correspondences a choice among many states needs."""
+"""How many times fewer observed samples a choice among many states needs."""
 
 PAIR_WEIGHT = 100.0
 """How many independent points the distances that the states keep are worth."""
@@ -60,13 +58,15 @@ class Misfit:
 
     Attributes:
         cloud: of one observed sample on average.
-        total: of cloud, correspondences, silhouette, prior and kept distances, as much as they are worth.
-        without_network: the total without the correspondences, for states that were found from different ones.
+        total: of cloud, silhouette, prior and kept distances, as much as they are worth.
     """
 
     cloud: float
     total: float
-    without_network: float
+
+
+class NoFit(ValueError):
+    """Frame to which no model can be fitted, for a reason that its sender can mend."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,24 +103,11 @@ class Problem:
     """
 
     model: StatisticalModel
-    network: NetworkTerm
     evidence: Observed
     scale_std: float
     config: FitConfig
     noise: float = 0.0
     given: GivenPose | None = None
-
-    @classmethod
-    def of(
-        cls,
-        model: StatisticalModel,
-        correspondences: Correspondences,
-        evidence: Observed,
-        scale_std: float,
-        config: FitConfig,
-    ) -> "Problem":
-        """Problem of a frame with correspondences of a network."""
-        return cls(model, NetworkTerm.of(model, correspondences), evidence, scale_std, config)
 
     @property
     def is_scale_open(self) -> bool:
@@ -133,8 +120,8 @@ class Problem:
         return PairTerm.of(self.model)
 
     @property
-    def network_sigma(self) -> float:
-        """Standard deviation of a correspondence, scene units."""
+    def first_sigma(self) -> float:
+        """The cloud's first standard deviation in a fit from far away, scene units."""
         return self.config.start_sigma * self.model.half
 
     def known(self, posed: Posed, prior: Prior, slack: float) -> NormalEquations:
@@ -306,9 +293,7 @@ class Problem:
         few = self.config.silhouette_vertices // COARSE
         config = replace(self.config, samples=1000, silhouette_vertices=few)
         some = slice(None, None, COARSE)
-        network = NetworkTerm(*(part[some] for part in vars(self.network).values()))
-        evidence = self.evidence.few(OBSERVED_SAMPLES // COARSE)
-        coarse = replace(self, network=network, evidence=evidence, config=config)
+        coarse = replace(self, evidence=self.evidence.few(OBSERVED_SAMPLES // COARSE), config=config)
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))
         return coarse
 
@@ -324,7 +309,6 @@ class Problem:
         few = samples.few(self.config.silhouette_vertices).position
         return self.total(
             float(robust_square(distance, sigma).mean()),
-            self.network.energy(posed, self.network_sigma),
             float(silhouette_losses(few, self.evidence, sigma).mean()),
             posed.z,
         )
@@ -334,11 +318,10 @@ class Problem:
         normal: NormalEquations,
         posed: Posed,
         sigma: float,
-        network_weight: float,
         exact: bool,
         surface: Surface | None = None,
     ) -> NormalEquations:
-        """Sum with cloud, silhouette and correspondences; ``exact`` uses the faces and not the samples.
+        """Sum with cloud and silhouette; ``exact`` uses the faces and not the samples.
 
         The state's ``surface`` may be there already.
         """
@@ -348,7 +331,6 @@ class Problem:
             planes = (surface or self.surface(posed)).planes(observed, self.far, self.alike)
         else:
             planes = samples.planes(observed, directions)
-        normal = self.network.add_to(normal, posed, self.network_sigma, network_weight, robust=True)
         weight, errors = self.config.cloud_weight, self.evidence.sample_errors
         normal = normal.add(*cloud_rows(posed, observed, planes, sigma, weight, errors, directions))
         return self.add_silhouette(normal, posed, samples, sigma)
@@ -377,8 +359,7 @@ class Problem:
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""
         surface = surface or self.surface(posed)
-        network = self.network.energy(posed, self.network_sigma)
-        return self.total(self.cloud_misfit(surface), network, self._silhouette_square(surface), posed.z)
+        return self.total(self.cloud_misfit(surface), self._silhouette_square(surface), posed.z)
 
     def silhouette_misfit(self, surface: Surface) -> float:
         """Misfit of all vertices that the frame rules out."""
@@ -394,15 +375,12 @@ class Problem:
         amount = self.evidence.violations(surface.material[self.model.silhouette_vertices], self.tolerance)[1]
         return float((amount > 1.0).mean())
 
-    def total(self, cloud: float, network: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
-        """Misfit from the mean squares of one observed sample, one correspondence and one silhouette vertex."""
-        network = network * self.config.network_weight[1]
+    def total(self, cloud: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
+        """Misfit from the mean squares of one observed sample and one silhouette vertex."""
         silhouette = silhouette * self.config.silhouette_weight * SILHOUETTE_VERTICES
         prior, pairs = float(z @ z), PAIR_WEIGHT * self.pairs.energy(z)
-        total = (
-            self.config.cloud_weight * cloud + network + silhouette + prior + pairs + self.evidence.shared_errors.square
-        )
-        return Misfit(cloud, total, total - network)
+        shared = self.evidence.shared_errors.square
+        return Misfit(cloud, self.config.cloud_weight * cloud + silhouette + prior + pairs + shared)
 
 
 # --- noise of a frame -------------------------------------------------------------------------------------------------

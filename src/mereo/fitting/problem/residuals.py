@@ -1,7 +1,7 @@
-"""Terms of the fit: the network's correspondences, the observed points, and what the frame rules out.
+"""Terms of the fit: the observed points, and what the frame rules out.
 
-Every term gives normal equations near a state; lengths in scene units, camera frame. Notation: n correspondences, p
-observed samples, k modes.
+Every term gives normal equations near a state; lengths in scene units, camera frame. Notation: p observed samples, k
+modes.
 """
 
 from collections.abc import Callable
@@ -14,9 +14,8 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from mereo.fitting.problem.correspondences import Correspondences
 from mereo.fitting.problem.evidence import Directions, Evidence, Observed, SharedErrors
-from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure, in_space
+from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import unit_rows
@@ -223,52 +222,6 @@ class Surface:
         return position, self.normals[face], modes.reshape(len(points), 3, -1)
 
 
-@dataclass(frozen=True, eq=False)
-class NetworkTerm:
-    """Correspondences: targets in the camera frame, mean and modes of the same points in the model, and weights."""
-
-    target: Float[np.ndarray, "n 3"]
-    mean: Float[np.ndarray, "n 3"]
-    modes: Float32[np.ndarray, "n 3 k"]
-    confidence: Float[np.ndarray, " n"]
-
-    @classmethod
-    def of(cls, model: StatisticalModel, correspondences: Correspondences) -> "NetworkTerm":
-        """Term of correspondences, whose rest positions follow the model."""
-        weights = model.weights(correspondences.rest, correspondences.labels)
-        return cls(correspondences.points, weights(model.mean), weights(model.modes), correspondences.confidence)
-
-    @classmethod
-    def none(cls, model: StatisticalModel) -> "NetworkTerm":
-        """Term without correspondences, which adds nothing."""
-        empty = np.empty((0, 3))
-        return cls(empty, empty, np.empty((0, 3, model.count), dtype=np.float32), np.empty(0))
-
-    def place(self, posed: Posed) -> Float[np.ndarray, "n 3"]:
-        """Positions that the state gives the points."""
-        return posed.place(self.mean + self.modes @ posed.z.astype(np.float32))
-
-    def energy(self, posed: Posed, sigma: float) -> float:
-        """Mean robust squared distance, in squared sigmas; 0 without correspondences."""
-        if len(self.target) == 0:
-            return 0.0
-        distance = np.linalg.norm(self.place(posed) - self.target, axis=1)
-        return float(self.confidence / self.confidence.sum() @ robust_square(distance, sigma))
-
-    def add_to(
-        self, normal: NormalEquations, posed: Posed, sigma: float, total_weight: float, robust: bool
-    ) -> NormalEquations:
-        """Sum with the squared distances, together worth as many independent points as ``total_weight``."""
-        if len(self.target) == 0:
-            return normal
-        points = self.place(posed)
-        offset = points - self.target
-        weight = self.confidence / self.confidence.sum() * (total_weight / sigma**2)
-        if robust:
-            weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * sigma)
-        return normal.add(in_space(posed, points, self.modes), offset.ravel(), np.repeat(weight, 3))
-
-
 def cloud_rows(
     posed: Posed,
     points: Float[np.ndarray, "p 3"],
@@ -410,7 +363,6 @@ class Terms:
     """
 
     known: NormalEquations
-    network: NormalEquations
     cloud: Rows
     observed_samples: Float[np.ndarray, "n 3"]
     ruled_out: NormalEquations
@@ -418,4 +370,4 @@ class Terms:
     @cached_property
     def total(self) -> NormalEquations:
         """All of them together."""
-        return self.known.plus(self.network).add(*self.cloud).plus(self.ruled_out)
+        return self.known.add(*self.cloud).plus(self.ruled_out)

@@ -42,14 +42,14 @@ class Candidate:
     """Modes fitted to the points that one hypothesis takes for the object's.
 
     Attributes:
-        encoded: these points, and what the network made of them.
+        encoded: these points, in the camera frame.
         modes: the fit; None where none was wanted, or none was found for ``error``.
     """
 
     encoded: EncodedFrame
     modes: ModesFit | None = None
     error: ValueError | None = None
-    located_by: LocatedBy = "network"
+    located_by: LocatedBy = "search"
 
     @property
     def hypothesis(self) -> Reading:
@@ -94,12 +94,6 @@ class Candidate:
             return None
         return self.modes.problem.evidence.unseen((registration.material / self.modes.unit)[registration.model.faces])
 
-    def displaced(self, registration: Registration) -> float | None:
-        """How far apart network and registration have the same points (``Signs.displaced``); None without a fit."""
-        if self.modes is None:
-            return None
-        return self.modes.correspondences.displaced(registration.model, registration.material / self.modes.unit)
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Answer:
@@ -115,7 +109,6 @@ class Answer:
         registration: of the deformation model, in the camera frame and the frame's unit; None without one.
         taken: whether the answer is the registered model; otherwise it is the network's.
         recognition: whether the frame shows the object, in a state that was learned; whoever answers.
-        likelier: the hypothesis that is likelier without a fit, encoded: from it the network answers.
         resolution: cells along the longest side of the object's box in ``reconstruction``.
         label_points: whether ``reconstruction`` also labels the observed points by segment.
         seconds: that it took, without ``reconstruction``.
@@ -133,7 +126,6 @@ class Answer:
     registration: Registration | None = None
     taken: bool = False
     recognition: Recognition = NOT_EVALUATED
-    likelier: EncodedFrame | None = None
     resolution: int = 128
     label_points: bool = False
     seconds: float = 0.0
@@ -192,8 +184,8 @@ class Answer:
         with stage("extract surfaces and labels"):
             if self.taken and self.registration is not None:
                 return self._registered_reconstruction(self.registration)
-            assert self.likelier is not None and self.model is not None  # else the registration is taken
-            return extract(self.likelier, self.model, self.resolution, self.label_points)
+            assert self.model is not None  # else the registration is taken
+            return extract(self.encoded, self.model, self.resolution, self.label_points)
 
     def _registered_reconstruction(self, registration: Registration) -> Reconstruction:
         """Make the reconstruction that is the registered model itself.
@@ -243,9 +235,9 @@ class Answer:
         """Surfaces of all segments alone, in the frame's axes and unit; raises as ``reconstruction`` does."""
         return self.reconstruction.surfaces if self.registered is None else self.registered.mesh
 
-    @property
+    @cached_property
     def encoded(self) -> EncodedFrame:
-        """Observed points of the registered model, encoded by the network, now where they were not before."""
-        if self.candidate is not None and (self.model is None or self.candidate.encoded.code is not None):
+        """Points that the answer takes for the object's, encoded by the network, if there is one."""
+        if self.candidate is not None and self.candidate.encoded.code is not None:
             return self.candidate.encoded
         return encode_frame(self.hypothesis, self.model, self.seen.frame.axes)

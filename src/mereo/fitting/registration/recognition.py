@@ -1,6 +1,6 @@
-"""Recognize whether a frame shows the object in a learned state, from what a fit and the network leave unexplained.
+"""Recognize whether a frame shows the object in a learned state, from what a fit leaves unexplained.
 
-    Registration, correspondences, stated scene unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
+    Registration, stated scene unit -Signs.of-> Signs -recognize-> Recognition (known or not, and why)
 
 A sign is a number that is small for the object in learned states, and grows with what is wrong. Views of the object
 tell how large some usually are, clean and under a camera's noise (``Calibration.recognizing``). How far all lie above
@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mereo.fitting.registration.registration import BELIEVED, Registration
-from mereo.models.calibration import Calibration, Recognizing, SignName, Usual
+from mereo.models.calibration import Calibration, Recognizing, Usual
 
 Known = bool | Literal["unsure"]
 
@@ -27,17 +27,16 @@ Of 295 right answers to training views of ten objects four lie beyond the first,
 MOST = 1e3
 """Strangeness that is not exceeded, and that of a frame in which nothing was found."""
 
-LEAST: Mapping[SignName, float] = {
+LEAST: Mapping[str, float] = {
     "size": 0.01,
     "unexplained": 0.1,
     "ruled_out": 0.01,
     "beyond": 0.1,
-    "displaced": 0.005,
     "unseen": 0.02,
 }
 """What is added to a sign before its logarithm is taken: less than that means nothing."""
 
-FIXED: Mapping[SignName, Usual] = {
+FIXED: Mapping[str, Usual] = {
     "size": Usual(mean=float(np.log(LEAST["size"] + 0.03)), std=0.3),
     "unseen": Usual(mean=float(np.log(LEAST["unseen"] + 0.02)), std=0.45),
 }
@@ -45,19 +44,17 @@ FIXED: Mapping[SignName, Usual] = {
 the answer (docs/experiments/078.md); of whole objects, cameras miss 2 to 3 %, of what was fitted to other things 10 to
 87 % (docs/experiments/075.md)."""
 
-MEASURED: tuple[SignName, ...] = ("unexplained", "ruled_out", "beyond", "displaced")
+MEASURED: tuple[str, ...] = ("unexplained", "ruled_out", "beyond")
 """Signs of which a calibration measures what is usual."""
 
 
-def _usual(*means: float) -> dict[SignName, Usual]:
+def _usual(*means: float) -> dict[str, Usual]:
     """Usual values of the ``MEASURED`` signs, with wider spreads of their logarithms than single objects have."""
-    usual = zip(MEASURED, means, (0.5, 0.5, 0.5, 0.4), strict=True)
-    return {name: Usual(mean=float(np.log(mean)), std=std) for name, mean, std in usual}
+    return {name: Usual(mean=float(np.log(mean)), std=0.5) for name, mean in zip(MEASURED, means, strict=True)}
 
 
 CONSERVATIVE, OF_SOLIDS = (
-    Recognizing(clean=_usual(unexplained, 0.015, 0.15, 0.06), noisy=_usual(0.6, 0.03, 0.2, 0.09))
-    for unexplained in (0.12, 0.3)
+    Recognizing(clean=_usual(unexplained, 0.015, 0.15), noisy=_usual(0.6, 0.03, 0.2)) for unexplained in (0.12, 0.3)
 )
 """For objects that were not calibrated, and for elastic solids among them: these are near their states and never in
 one, so that right answers leave up to 6 % of the points, fits to other things 9 to 80 % (docs/experiments/077.md)."""
@@ -75,8 +72,6 @@ class Signs:
         ruled_out: share of the model's surface that the frame rules out.
         beyond: how far the state lies outside all that were learned, scene units; None at rest.
         unusual: ``StatisticalModel.unusual``, which needs no usual value; None at rest.
-        displaced: how far apart network and registered model have the same places of the object, as a share of half its
-            length (``Correspondences.displaced``); None without correspondences.
         unseen: share of what the camera would see of the model that it has not seen, though nothing is known to hide it
             (``Evidence.unseen``); None where the frame says what is around the object.
     """
@@ -86,14 +81,12 @@ class Signs:
     ruled_out: float | None = None
     beyond: float | None = None
     unusual: float | None = None
-    displaced: float | None = None
     unseen: float | None = None
 
     @classmethod
     def of(
         cls,
         registration: Registration,
-        displaced: float | None = None,
         stated_scene_unit: float | None = None,
         unseen: float | None = None,
     ) -> "Signs":
@@ -106,19 +99,18 @@ class Signs:
             ruled_out=registration.ruled_out,
             beyond=None if is_learned else registration.beyond_states,
             unusual=None if is_learned or not len(z) else registration.model.unusual(z),
-            displaced=displaced,
             unseen=unseen,
         )
 
     @property
-    def logarithms(self) -> dict[SignName, float]:
+    def logarithms(self) -> dict[str, float]:
         """Logarithms of the signs that are known, of which views of the object tell what is usual."""
         signs = {name: getattr(self, name) for name in LEAST}
         return {name: float(np.log(value + LEAST[name])) for name, value in signs.items() if value is not None}
 
-    def strange(self, usual: Mapping[SignName, Usual]) -> dict[SignName, float]:
+    def strange(self, usual: Mapping[str, Usual]) -> dict[str, float]:
         """Standard deviations by which each sign lies above what is usual; 0 where it does not."""
-        known, strange = {**usual, **FIXED}, dict[SignName, float]()
+        known, strange = {**usual, **FIXED}, dict[str, float]()
         for name, value in self.logarithms.items():
             if name in known:  # the few views of a calibration are more alike than others will be
                 least = known[name] if name in FIXED else CONSERVATIVE.clean[name]
@@ -128,7 +120,7 @@ class Signs:
         return {name: min(max(value, 0.0), MOST) for name, value in strange.items()}
 
 
-def strangeness(strange: Mapping[SignName, float]) -> float:
+def strangeness(strange: Mapping[str, float]) -> float:
     """Strangeness of a frame by all its signs: the root of the sum of their squares."""
     return min(float(np.sqrt(sum(value**2 for value in strange.values()))), MOST)
 
@@ -187,7 +179,6 @@ NOT_EVALUATED = Recognition("unsure", "the network alone cannot tell its object 
 def recognize(
     registration: Registration | None,
     calibration: Calibration | None = None,
-    displaced: float | None = None,
     stated_scene_unit: float | None = None,
     refusal: str | None = None,
     unseen: float | None = None,
@@ -197,7 +188,6 @@ def recognize(
     Args:
         registration: of the object's model to the frame; None where none was found or none was wanted.
         calibration: of the weights, with what is usual.
-        displaced: as in ``Signs``.
         stated_scene_unit: length of a scene unit in the frame's unit, where the input states that.
         refusal: why no registration was found; None where none was wanted, and then recognition is not possible.
         unseen: as in ``Signs``.
@@ -206,7 +196,7 @@ def recognize(
         return NOT_EVALUATED if refusal is None else Recognition(False, refusal, MOST)
     calibrated = None if calibration is None else calibration.recognizing
     usual = calibrated or (OF_SOLIDS if registration.model.is_normal else CONSERVATIVE)
-    signs = Signs.of(registration, displaced, stated_scene_unit, unseen)
+    signs = Signs.of(registration, stated_scene_unit, unseen)
     each = signs.strange(usual.noisy if is_noisy(registration) else usual.clean)
     total = strangeness(each)
     is_usual = total <= UNSURE
@@ -229,7 +219,7 @@ LOOK = "look at the result before you rely on it"
 WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it again"
 
 
-def _reason(sign: SignName, registration: Registration, signs: Signs) -> str:
+def _reason(sign: str, registration: Registration, signs: Signs) -> str:
     """Sentence about the sign that is strangest, with what to do."""
     if sign == "size":
         return (
@@ -263,9 +253,4 @@ def _reason(sign: SignName, registration: Registration, signs: Signs) -> str:
             f"the state lies {registration.beyond_states:.1f} scene units outside those that were learned, and rigid "
             f"parts may be bent: {WIDEN}"
         )
-    if sign == "unusual":
-        return f"the object would be bent farther than in the states that were learned: {WIDEN}"
-    return (
-        f"network and registered model have the same places of the object {signs.displaced or 0.0:.0%} of half its "
-        f"length apart: {LOOK}, or name the object's own weights"
-    )
+    return f"the object would be bent farther than in the states that were learned: {WIDEN}"

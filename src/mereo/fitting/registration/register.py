@@ -1,6 +1,6 @@
 """The object's own deformation model, fitted to frames: set up once for an object, then used for every frame.
 
-CloudToFit, correspondences -fit_frame-> ModesFit -Registrar.finish-> Registration
+CloudToFit -search_modes-> ModesFit -Registrar.finish-> Registration
 """
 
 import time
@@ -17,16 +17,9 @@ from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, fit_draws
 from mereo.fitting.draws.fit import narrowing as draws_narrowing
 from mereo.fitting.draws.fit import settled as settled_draws
 from mereo.fitting.draws.playback import MOST_DRAWS, STATES_SEED, Drawn, DrawnStates
-from mereo.fitting.modes import (
-    PredictCorrespondences,
-    ScoredFit,
-    fit_seen,
-    of_rest,
-    resting,
-    settled,
-)
+from mereo.fitting.modes import ScoredFit, of_rest, resting, settled
 from mereo.fitting.modes import narrowing as modes_narrowing
-from mereo.fitting.problem.correspondences import Correspondences, NoFit, agree, estimate_unit, find_correspondences
+from mereo.fitting.problem.correspondences import Correspondences, find_correspondences
 from mereo.fitting.problem.evidence import (
     MOST_POINTS,
     OBSERVED_SAMPLES,
@@ -41,7 +34,7 @@ from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.registration import Method, Registration
 from mereo.fitting.uncertainty import LEAST_RADIUS, DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.brief import listed
-from mereo.geometry.camera import PointCloud, SightLines
+from mereo.geometry.camera import SightLines
 from mereo.geometry.symmetry import describe_symmetries
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
@@ -61,8 +54,6 @@ class CloudToFit:
     Attributes:
         points: observed points of the object.
         scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
-        is_unit_certain: whether that is known for certain; else it is believed where the network's correspondences
-            agree with it.
         outliers: points that were left out: along their lines of sight nothing is known.
         lines: what is known of the lines of sight around the cloud.
         normals: out of the surface, of a surface that no single camera saw, as ``lines`` say; None where unknown.
@@ -70,7 +61,6 @@ class CloudToFit:
 
     points: Float[np.ndarray, "n 3"]
     scene_unit: float | None = None
-    is_unit_certain: bool = True
     outliers: Float[np.ndarray, "o 3"] | None = None
     lines: SightLines = UNDECIDED
     normals: Float[np.ndarray, "n 3"] | None = None
@@ -98,53 +88,21 @@ class ModesFit:
 
     Attributes:
         problem: everything the fit works on, scene units.
-        correspondences: of the network, scene units.
         unit: length of a scene unit in the cloud's unit, before the fit's own scale.
         posed: coefficients and pose.
         seconds: that it took.
         rest: pose of the rest model, where the frame speaks for an object at rest; then that is the answer.
-        calibration: the network's, by which radii are scaled.
+        calibration: of the object's weights, by which radii are scaled.
         others: positions of the material points in other states that a search found to explain the frame alike.
     """
 
     problem: Problem
-    correspondences: Correspondences
     unit: float
     posed: Posed
     seconds: float
     rest: ScoredFit | None = None
     calibration: Calibration | None = None
     others: tuple[Float[np.ndarray, "m 3"], ...] = ()
-
-    @classmethod
-    def of(
-        cls,
-        cloud: CloudToFit,
-        correspondences: Correspondences,
-        model: StatisticalModel,
-        config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-        predict: PredictCorrespondences | None = None,
-    ) -> "ModesFit":
-        """Fit the modes to a cloud, with correspondences in its unit.
-
-        Args:
-            cloud: its lines of sight went past the object where it leaves that open.
-            correspondences: of the network, or others.
-            model: the statistical model.
-            config: constants.
-            predict: the network, about points of the camera frame in the cloud's unit; None without one.
-        """
-        started = time.perf_counter()
-        unit = estimate_unit(correspondences) if cloud.scene_unit is None else cloud.scene_unit
-        correspondences = correspondences.scaled(1 / unit)
-
-        with limit_blas_threads():
-            evidence = cloud.evidence(unit)
-            problem = Problem.of(model, correspondences, evidence, cloud.scale_std, config).with_noise(evidence.noise)
-            scaled = None if predict is None else lambda seen: predict(seen * unit).scaled(1 / unit)
-            problem, correspondences, modes = fit_seen(problem, correspondences, cloud.points / unit, scaled)
-            rest = resting(problem, correspondences, modes)
-        return cls(problem, correspondences, unit, modes.posed, time.perf_counter() - started, rest)
 
     @property
     def may_take_draws(self) -> bool:
@@ -168,7 +126,7 @@ class ModesFit:
     def registration(self) -> Registration:
         """Registration of the modes, or of the rest model where the frame speaks for that."""
         if self.rest is not None:
-            problem, posed = of_rest(self.problem, self.correspondences), self.rest.posed
+            problem, posed = of_rest(self.problem), self.rest.posed
             bent = self.posed.place(self.problem.model.material(self.posed.z))
             end = ModesOptimum(problem, posed, self.unit, self.others, bent)
             return self._registration("rest", self.problem.model.rest_z, end, posed, self.surface)
@@ -181,7 +139,7 @@ class ModesFit:
             return self
         with limit_blas_threads():
             modes = settled(self.problem, self.posed)
-            rest = resting(modes.problem, self.correspondences, modes)
+            rest = resting(modes.problem, modes)
         # the errors that neighbours share are those by the answer; few samples are edges more often than points are
         problem = modes.problem.changed(evidence=(rest or modes).problem.evidence.with_more_samples)
         return replace(self, problem=problem, posed=modes.posed, rest=rest)
@@ -196,7 +154,7 @@ class ModesFit:
             return self.registration
         started = time.perf_counter()
         with limit_blas_threads():
-            problem = DrawsProblem.of(self.problem, states, self.correspondences)
+            problem = DrawsProblem.of(self.problem, states)
             drawn = fit_draws(problem, self.posed)
             taken = drawn is not None and is_drawn(problem, drawn, self.posed, self.rest)
         seconds = self.seconds + time.perf_counter() - started
@@ -225,7 +183,7 @@ class ModesFit:
             scene_unit=self.unit * float(np.exp(posed.log_scale)),
             unit_known=not self.problem.is_scale_open,
             explained=explained,
-            accepted=self._is_believed(explained, surface),
+            accepted=explained >= self.problem.accepted,
             seconds=self.seconds,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
             ruled_out=self.problem.ruled_out(surface),
@@ -236,23 +194,6 @@ class ModesFit:
             alike=1 + len(self.others),
         )
 
-    def _is_believed(self, explained: float, surface: Surface) -> bool:
-        """Whether a fit explains enough of the points; less is enough where the network sees the same segments there.
-
-        On clean training views the fit was better than the network in each that the second rule adds.
-        """
-        least = min(self.problem.accepted, 0.85)
-        return explained >= self.problem.accepted or (explained >= least and self._agreement(surface) >= 0.8)
-
-    def _agreement(self, surface: Surface) -> float:
-        """Share of the correspondences on the object whose segment is that of the nearest position of the surface."""
-        seen = self.correspondences.rows(self.correspondences.observed)
-        if len(seen.points) == 0:  # a tracked frame, without correspondences
-            return 0.0
-        face = surface.nearest(seen.points)[1]
-        model = self.problem.model
-        return float((model.labels[model.faces[surface.facing[face], 0]] == seen.labels).mean())
-
 
 def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: ScoredFit | None = None) -> bool:
     """Whether a state of the draws is to be preferred to the modes, or to the rest model, where that is given.
@@ -260,58 +201,10 @@ def is_drawn(problem: DrawsProblem, drawn: DrawsFit, modes: Posed, rest: ScoredF
     By the points that the answer was fitted to.
     """
     if rest is not None:
-        unbent = of_rest(problem.last, problem.correspondences).misfit(rest.posed).total
+        unbent = of_rest(problem.last).misfit(rest.posed).total
         return drawn.misfit + draws_narrowing(problem, drawn) < unbent
     gain = drawn.misfit - problem.last.misfit(modes).total
     return gain < 0 or gain < modes_narrowing(problem.base, modes) - draws_narrowing(problem, drawn)
-
-
-def fit_frame(
-    cloud: CloudToFit,
-    network: Trained,
-    model: StatisticalModel,
-    config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
-    code: EncodedCloud | None = None,
-) -> ModesFit:
-    """Fit the modes to a cloud from the network's correspondences.
-
-    Args:
-        cloud: the observed points, with what is known of their unit and surroundings.
-        network: trained on this object, with rest coordinates.
-        model: statistical model of the same object.
-        config: constants.
-        code: of the cloud, where it is known already.
-
-    Raises ``NoFit`` for a network without rest coordinates or of other segments, and where it finds too little.
-    """
-    started = time.perf_counter()
-    if network.names != model.rest.names:
-        raise NoFit(
-            f"the weights know the segments {', '.join(network.names)} but the statistical model has "
-            f"{', '.join(model.rest.names)}; they must be of one object: build the model from the weights' own scene"
-        )
-    code = network.encode(PointCloud(cloud.points)) if code is None else code
-    correspondences = predict_correspondences(network, model, code)
-    unit = cloud.scene_unit
-    if unit is not None and not cloud.is_unit_certain and not agree(estimate_unit(correspondences), unit):
-        cloud = replace(cloud, scene_unit=None)
-    encoding_s = time.perf_counter() - started
-
-    def predict(points: Float[np.ndarray, "s 3"]) -> Correspondences:
-        return predict_correspondences(network, model, network.encode(PointCloud(points)))
-
-    fitted = ModesFit.of(cloud, correspondences, model, config, predict)
-    return replace(fitted, seconds=fitted.seconds + encoding_s, calibration=network.calibration)
-
-
-def predict_correspondences(network: Trained, model: StatisticalModel, code: EncodedCloud) -> Correspondences:
-    """Predict correspondences of a cloud with the network, and return an even subset."""
-    correspondences = find_correspondences(network, code, model.rest_center, model.half)
-    if correspondences is None:
-        raise NoFit(
-            "the weights predict no rest coordinates, from which a fit starts; train with a dataset that has a template"
-        )
-    return correspondences.evenly()
 
 
 # --- the registrar of an object ---------------------------------------------------------------------------------------
@@ -326,7 +219,7 @@ class Registrar:
     """Registers one object's deformation model to frames.
 
     Attributes:
-        network: the weights, from whose correspondences a fit starts; None of an object without, which is searched.
+        network: the weights, from whose guess a search begins; None of an object without.
         model: statistical model of the same object.
         method: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
             misfit; "auto" does the same where the scene is at hand, and else fits the modes; "search" is "auto"
@@ -356,6 +249,22 @@ class Registrar:
         given = load_scene(scene) if isinstance(scene, str) else scene
         return cls(network, statistical_model_of(network), method, given).checked()
 
+    @property
+    def starting_network(self) -> Trained | None:
+        """The network from whose guess a search begins; None without one, and where it is left out."""
+        return None if self.method == "search" else self.network
+
+    def correspondences(self, code: EncodedCloud | None) -> Correspondences | None:
+        """What the network says of a cloud that it has encoded; None where it has not."""
+        if self.network is None or code is None:
+            return None
+        return find_correspondences(self.network, code, self.model)
+
+    @property
+    def calibration(self) -> Calibration | None:
+        """Of the weights."""
+        return None if self.network is None else self.network.calibration
+
     def checked(self) -> "Registrar":
         """Return itself; raise ``ValueError`` where ``method`` is "full" without the object's scene."""
         if self.method == "full" and self.scene is None:
@@ -371,11 +280,6 @@ class Registrar:
         if self.network is not None:
             return str(self.network.provenance.get("scene"))
         return "" if self.given is None else self.given.name
-
-    @property
-    def asks_network(self) -> bool:
-        """Whether a fit starts from the network's correspondences, and not by a search."""
-        return self.network is not None and self.method != "search"
 
     @cached_property
     def scene(self) -> Scene | None:
@@ -400,12 +304,6 @@ class Registrar:
         raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --method modes")
 
     @property
-    def asks_search(self) -> bool:
-        """Whether a search follows where the network's fit does not explain the frame: seconds a frame."""
-        is_same_object = self.network is not None and self.network.names == self.model.rest.names
-        return self.method == "auto" and self.config.retries and is_same_object
-
-    @property
     def fits_draws(self) -> bool:
         """Whether the scene's draws are fitted too, for which its states are simulated once, in seconds."""
         return self.method != "modes"
@@ -414,11 +312,6 @@ class Registrar:
         """Simulate once the states in which a fit of draws begins, where draws are fitted; raises as that does."""
         if self.fits_draws:
             _ = self.states_or_none
-
-    @property
-    def without_retries(self) -> "Registrar":
-        """The same without what takes seconds where the network's fit does not explain the frame."""
-        return replace(self, constants=replace(self.config, retries=False)) if self.asks_network else self
 
     def asking(self, network: Trained | None) -> "Registrar":
         """The same with the same weights on another device; scene and states that are known stay so."""
@@ -440,11 +333,6 @@ class Registrar:
             return None
         unit_m = frame.unit_m / registration.scene_unit
         return 1.0 if registration.unit_known and abs(unit_m - 1.0) < 1e-6 else unit_m
-
-    def fit_modes(self, cloud: CloudToFit, code: EncodedCloud | None = None) -> ModesFit:
-        """Fit of the modes from the network, with ``fit_frame``'s arguments; raises ``NoFit`` as that does."""
-        assert self.network is not None
-        return fit_frame(cloud, self.network, self.model, self.config, code)
 
     def finish(self, fitted: ModesFit) -> Registration:
         """Return the registration from a fit of the modes, with the draws too where ``method`` wants them.
