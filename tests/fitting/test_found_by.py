@@ -72,6 +72,18 @@ def test_a_network_that_is_lost_does_no_harm(
     assert np.median(norm(found.registration.material - right.registration.material, axis=1)) < 1.0
 
 
+def test_what_a_network_says_is_evidence(liver: Model, cloud: PointCloud) -> None:
+    """It speaks against a state that is elsewhere by as many points as it is worth, and of nothing else."""
+    modes = answer_to(cloud, liver, Registrar.of(liver), 24, scene_unit=1.0).candidate.modes
+    problem, surface = modes.problem, modes.surface
+    elsewhere = Surface.through(problem.model, surface.material[::-1])
+    assert 0 < problem.network_misfit(surface) < 0.2 * problem.network_misfit(elsewhere)
+    deaf = problem.changed(network=None)
+    for each in (surface, elsewhere):
+        more = problem.misfit(modes.posed, each).total - deaf.misfit(modes.posed, each).total
+        assert more == pytest.approx(problem.network_misfit(each)) and deaf.network_misfit(each) == 0.0
+
+
 def test_weights_calibrate_what_a_search_finds_and_say_how_sure_they_are(liver: Model, cloud: PointCloud) -> None:
     found = answer_to(cloud, liver, Registrar.of(liver), 24)
     assert found.located_by == "search" and found.taken and found.registration is not None

@@ -7,6 +7,8 @@
 2. The best that differ are bent towards the frame by few points, from wide to narrow.
 3. The best of these are fitted as a frame always is, as long as they may be better or as good.
 4. Where the frame is not explained, the same again from other states of the library.
+
+States that are known or guessed, as by a network, are fitted before.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -617,6 +619,8 @@ def search(
 ) -> Trail:
     """Search for the state that explains a frame, first from ``starts``, then in rounds.
 
+    What explains a clean frame is searched for no further; under noise several states do, of which a start is one.
+
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
     is taken where it explains the frame better by more than ``WHOLE``.
     """
@@ -625,7 +629,7 @@ def search(
         for trail in trails:
             trail.fitted += [refined(trail.problem, fit_wide(trail.problem, start)) for start in starts]
         chosen = likelier(with_left_noise(trails))
-        if not rounds or chosen.is_explained:
+        if not rounds or (chosen.is_explained and not chosen.problem.shares_noise):
             return chosen.with_heavier_cloud() or chosen.with_shared_noise()
     for stage in rounds:
         for trail in trails:

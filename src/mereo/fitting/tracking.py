@@ -77,7 +77,9 @@ class Track:
         base, model = fitted.problem, fitted.problem.model
         scale_std = config.scale_std if base.is_scale_open else KNOWN_SCALE_STD
         return cls(
-            problem=base.changed(scale_std=scale_std, config=constants).with_noise(base.left_noise(fitted.surface)),
+            problem=base.changed(network=None, scale_std=scale_std, config=constants).with_noise(
+                base.left_noise(fitted.surface)
+            ),
             unit=fitted.unit * scale,
             posed=posed,
             time_s=time_s,
@@ -369,9 +371,8 @@ class Tracker:
             scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
             keep_all: take every point for the object's.
 
-        The first frame is waited for, however long a search takes. Raises ``ValueError`` for unusable clouds and,
-        unless a network or a track can answer, where a frame that is fitted by itself finds too little. The track is
-        kept: the object may come again.
+        The first frame is waited for, however long a search takes. Raises ``ValueError`` where that is unusable or,
+        unless a network can answer, shows too little; of later frames the object is then lost, and the track is kept.
         """
         started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all)
         tracked, why = self._tracked(self._track, frame, self.config.longest_s)

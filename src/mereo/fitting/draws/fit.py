@@ -138,7 +138,9 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     cloud = base.config.cloud_weight * float(robust_square(fit.distance, sigma).mean())
     losses = silhouette_losses(fit.surface.material[base.model.silhouette_vertices], base.evidence, sigma)
     outside = base.config.silhouette_weight * float(losses.sum())
-    return cloud + outside + float(fit.z @ fit.z) + base.evidence.shared_errors.square
+    return (
+        cloud + base.network_misfit(fit.surface) + outside + float(fit.z @ fit.z) + base.evidence.shared_errors.square
+    )
 
 
 def by_misfit(state: "DrawsFit | StateOnShape") -> float:

@@ -7,7 +7,7 @@ evaluated at the observed points and along the lines of sight behind them: where
 rest position of that point. It is right on what is seen and vague on what is hidden, so that a fit only begins there.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from mereo.deformation.moving_least_squares import spread
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import ROBUST, Prior
+from mereo.fitting.problem.residuals import ROBUST, NetworkTerm, Prior
 from mereo.geometry.transforms import robust_rigid
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
@@ -77,10 +77,11 @@ def find_correspondences(network: Trained, code: EncodedCloud, model: Statistica
     return Correspondences(places, rest * model.half + model.rest_center, labels, confidence).rows(rows)
 
 
-def fit_correspondences(problem: Problem, matches: Correspondences, unit: float) -> Posed:
+def fit_correspondences(problem: Problem, matches: Correspondences, unit: float) -> tuple[Problem, Posed]:
     """Fit pose and modes to correspondences alone, from the mean state and from wide to narrow.
 
-    ``unit`` is the length of a scene unit of the problem in that of the correspondences.
+    ``unit`` is the length of a scene unit of the problem in that of the correspondences. Returns the problem with them
+    as its ``network``, too.
     """
     model, target, sigma = problem.model, matches.points / unit, problem.first_sigma
     weights = model.weights(matches.rest, matches.labels)
@@ -96,7 +97,7 @@ def fit_correspondences(problem: Problem, matches: Correspondences, unit: float)
         normal = problem.known(posed, Prior.whole(model), 0.0)
         normal = normal.add(in_space(posed, points, modes), offset.ravel(), np.repeat(weight, 3))
         posed = posed.moved(normal.step(DAMPING))
-    return posed
+    return replace(problem, network=NetworkTerm(target, weights, matches.confidence)), posed
 
 
 def scale_of(matches: Correspondences, unit: float) -> float:

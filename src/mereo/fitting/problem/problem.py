@@ -29,6 +29,7 @@ from mereo.fitting.problem.gauss_newton import (
 from mereo.fitting.problem.residuals import (
     ROBUST,
     Met,
+    NetworkTerm,
     PairTerm,
     PosedSamples,
     Prior,
@@ -45,8 +46,8 @@ from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 COARSE = 3
 """How many times fewer observed samples a choice among many states needs."""
 
-PAIR_WEIGHT = 100.0
-"""How many independent points the distances that the states keep are worth."""
+PAIR_WEIGHT, NETWORK_WEIGHT = 100.0, 10.0
+"""How many independent points the distances that the states keep are worth, and what a network says."""
 
 KNOWN_SCALE_STD, OPEN_SCALE_STD = 1e-6, 0.1
 """``Problem.scale_std`` of a frame whose unit is known, and of one whose unit is not."""
@@ -58,7 +59,7 @@ class Misfit:
 
     Attributes:
         cloud: of one observed sample on average.
-        total: of cloud, silhouette, prior and kept distances, as much as they are worth.
+        total: of cloud, network, silhouette, prior and kept distances, as much as they are worth.
     """
 
     cloud: float
@@ -100,6 +101,7 @@ class Problem:
         config: constants, as a clean frame has them.
         noise: standard deviation of the observed points from the surface (``with_noise``).
         given: pose that is known; None where the frame alone says it.
+        network: what a network says; it tells states that look alike apart, and no fit descends by it.
     """
 
     model: StatisticalModel
@@ -108,6 +110,7 @@ class Problem:
     config: FitConfig
     noise: float = 0.0
     given: GivenPose | None = None
+    network: NetworkTerm | None = None
 
     @property
     def is_scale_open(self) -> bool:
@@ -359,7 +362,14 @@ class Problem:
     def misfit(self, posed: Posed, surface: Surface | None = None) -> Misfit:
         """Misfit of a state, whose ``surface`` may be there already."""
         surface = surface or self.surface(posed)
-        return self.total(self.cloud_misfit(surface), self._silhouette_square(surface), posed.z)
+        shown = self.total(self.cloud_misfit(surface), self._silhouette_square(surface), posed.z)
+        return replace(shown, total=shown.total + self.network_misfit(surface))
+
+    def network_misfit(self, surface: Surface) -> float:
+        """Misfit of what a network says; 0 without one."""
+        if self.network is None:
+            return 0.0
+        return NETWORK_WEIGHT * self.network.energy(surface.material, self.first_sigma)
 
     def silhouette_misfit(self, surface: Surface) -> float:
         """Misfit of all vertices that the frame rules out."""

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
+from mereo.deformation.moving_least_squares import PointWeights
 from mereo.fitting.problem.evidence import Directions, Evidence, Observed, SharedErrors
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure
 from mereo.geometry.mesh import barycentric
@@ -220,6 +221,26 @@ class Surface:
         weight = barycentric(self.material[corners], position).astype(np.float32)
         modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
         return position, self.normals[face], modes.reshape(len(points), 3, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class NetworkTerm:
+    """Where a network has places of the object.
+
+    Attributes:
+        target: in the camera frame, scene units.
+        weights: how these places follow the material points.
+        confidence: of each, as a weight.
+    """
+
+    target: Float[np.ndarray, "n 3"]
+    weights: PointWeights
+    confidence: Float[np.ndarray, " n"]
+
+    def energy(self, material: Float[np.ndarray, "m 3"], sigma: float) -> float:
+        """Mean robust squared distance from where a state's material points have them, in squared sigmas."""
+        distance = np.linalg.norm(self.weights(material) - self.target, axis=1)
+        return float(self.confidence @ robust_square(distance, sigma) / self.confidence.sum())
 
 
 def cloud_rows(

@@ -284,7 +284,8 @@ def search_modes(
         whole = Problem(model, evidence, cloud.scale_std, config, given=given)
         whole = whole.with_noise(evidence.noise)
         if matches is not None:
-            starts = (*starts, fit_correspondences(whole, matches, unit))
+            whole, guess = fit_correspondences(whole, matches, unit)
+            starts = (*starts, guess)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
         trail = search(whole, partial, starts, rounds)
         problem, modes = trail.problem, trail.best
