@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from math import pi
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,9 +25,11 @@ import mereo.__main__ as command_line
 from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
 from mereo.fitting.problem.residuals import are_near
+from mereo.fitting.tracking import SynchronousExecutor
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Range
 from mereo.geometry.mesh_check import examine
+from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid
 from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
@@ -57,8 +60,13 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gripper(tmp_path_factory.mktemp("robots"))
 
 
-def write_frame(path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128) -> list[float]:
-    """Write the noisy depth cloud in metres of free joints at shares of their ranges; returns the values."""
+def write_frame(
+    path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128, seen_parts: int = 99
+) -> list[float]:
+    """Write the noisy depth cloud in metres of free joints at shares of their ranges; returns the values.
+
+    Of segments after the first ``seen_parts`` nothing is seen.
+    """
     motion = scene.sample_deformations
     assert isinstance(motion, RandomMotion) and scene.unit_m is not None
     leaders = [joint for joint, _ in motion.joints.values() if not joint.follows]
@@ -67,7 +75,9 @@ def write_frame(path: Path, scene: Scene, shares: Sequence[float], seed: int, pi
     rng = default_rng(seed)
     seen = mesh.transformed(inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0))))
     image = add_depth_noise(render_depth(seen, Camera.from_fov(pixels, pixels, scene.workspace.fov_rad)), 0.1, rng)
-    write_positions_ply(path, image.to_points().points * scene.unit_m)
+    points = image.to_points().points
+    points = points[Solids(seen).nearest(points).owner < seen_parts]
+    write_positions_ply(path, points * scene.unit_m)
     values = [joint.limits[0] + share * np.ptp(joint.limits) for joint, share in zip(leaders, shares, strict=True)]
     return [float(value) * (1 if leaders[0].turns else scene.unit_m) for value in values]  # all turn, or all slide
 
@@ -604,3 +614,66 @@ def test_a_frame_that_contradicts_a_known_value_is_not_believed(known: mereo.Obj
     (true,) = write_frame(tmp_path / "frame.ply", known.scene, [0.4], 5)
     result = mereo.reconstruct(tmp_path / "frame.ply", known, unit_m=1.0, joints={"finger": true + 0.01})
     assert result.known is False and result.joints["finger"].value == pytest.approx(true + 0.01, abs=1e-12)
+
+
+def test_fingers_that_nothing_shows_are_where_the_encoder_says_in_each_frame(
+    known: mereo.Object, tmp_path: Path
+) -> None:
+    """Followed from the last frame's state, and found again by a search."""
+    assert known.scene is not None and known.joints == ("other finger", "finger")
+    frame, times = tmp_path / "frame.ply", (0.0, 0.1, 0.2, 0.3, 99.0)
+    with mereo.Tracker(known, executor=SynchronousExecutor()) as tracker:
+        for time_s, share, seen_parts in zip(times, (0.2, 0.4, 0.6, 0.8, 0.1), (3, 1, 1, 3, 3), strict=True):
+            (true,) = write_frame(frame, known.scene, [share], 5, seen_parts=seen_parts)
+            result = tracker.follow(frame, time_s, unit_m=1.0, extent="partial", joints={"finger": true})
+            assert result.tracking == ("followed" if 0 < time_s < 1 else "found") and result.known is True
+            assert result.joints["finger"].interval == pytest.approx((true, true), abs=1e-9)
+            for name, x in (("left", -0.01 - true), ("right", 0.01 + 0.5 * true + 0.002)):
+                assert_allclose(result[name].pose_in("palm")[:3, 3], [x, 0, 0.047], atol=2e-4)
+        (true,) = write_frame(frame, known.scene, [0.3], 5, seen_parts=1)
+        unseen = tracker.follow(frame, 99.1, unit_m=1.0, extent="partial").joints["finger"]
+    assert unseen.interval is not None and np.ptp(unseen.interval) > 0.002, "of which nothing is given"
+
+
+@pytest.fixture
+def following(known: mereo.Object, gripper: Path, working_folder: Path, capsys: pytest.CaptureFixture) -> Any:
+    """Clouds of a moving gripper, and what a stream of them prints and says, with a source of joints."""
+    assert known.scene is not None
+    Path("frames").mkdir()
+    true = [write_frame(Path(f"frames/{i}.ply"), known.scene, [0.4 + 0.1 * i], 5)[0] for i in range(3)]
+
+    def stream(source: Path, joints: str, *options: object) -> tuple[list[Any], str]:
+        run_mereo("stream", source, "--object", gripper, "--every-frame", "--joints", joints, *options)
+        printed = capsys.readouterr()
+        return [*map(json.loads, printed.out.splitlines())], printed.err
+
+    return true, stream
+
+
+def test_a_stream_reads_the_joints_of_each_frame(following: Any) -> None:
+    true, stream = following
+    Path("joints").mkdir()
+    Path("joints/0.yaml").write_text(f"finger: {true[0]}")
+    Path("joints/2.json").write_text(f'{{"finger": {true[2]}}}')
+    lines, _ = stream(Path("frames"), "joints", "--unit-m", "1")
+    assert lines.pop(1)["error"] == "joints/1.yaml does not exist; a file of joints is needed: check the path"
+    for line, value in zip(lines, true[::2], strict=True):
+        assert_allclose(line["joints"]["finger"]["interval"], value, atol=1e-6)
+
+
+def test_a_stream_reads_the_joints_that_a_recording_has(following: Any) -> None:
+    bags = pytest.importorskip("recorded_bags", reason="rosbags comes with the extra sensors")
+    (true, *_), stream = following
+    points = trimesh.load("frames/0.ply").vertices
+    bag = bags.write_bag(
+        Path("robot.mcap"),
+        2,
+        lambda make: {
+            "/points": [make.cloud(points[len(points) % 2 :])] * 3,
+            "/joint_states": [make.joints(wheel=1.0, finger=true)],
+        },
+    )
+    for line in stream(bag, "/joint_states")[0][1:]:  # the first is as early as the values
+        assert_allclose(line["joints"]["finger"]["interval"], true, atol=1e-6)
+    sentence = "has no joint states on topic '/wheels'; those it has are on: /joint_states"
+    assert sentence in stream(bag, "/wheels")[1]

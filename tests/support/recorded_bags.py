@@ -63,6 +63,11 @@ class Messages:
             **values,
         )  # fmt: skip
 
+    def joints(self, **values: float) -> Any:
+        empty, position = np.empty(0), np.array([*values.values()])
+        kind = self.types["sensor_msgs/msg/JointState"]
+        return kind(header=self.header(), name=[*values], position=position, velocity=empty, effort=empty)
+
     def cloud(self, points: ndarray) -> Any:
         """Two rows; x, y, z as floats after four bytes of something else, and four of padding at the end of a row."""
         field = self.types["sensor_msgs/msg/PointField"]
