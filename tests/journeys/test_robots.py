@@ -267,6 +267,12 @@ def test_shells_of_a_link_that_overlap_are_no_fault_and_a_repair_unites_them(
     assert "note: it intersects itself" in capsys.readouterr().out
     run_mereo("scene", "check", "laptop.yaml", "--repair")
     assert "repaired base: united 2 shells that overlap" in capsys.readouterr().out
+    before, after = (load_scene(f"laptop{end}.yaml").link_frames for end in ("", "-repaired"))
+    assert_array_equal([*after.values()], [*before.values()])
+    text = Path("laptop-repaired.yaml").read_text()
+    Path("bad.yaml").write_text(text.replace("- [1.0, 0.0, 0.0, 0.0]", "- [2.0, 0.0, 0.0, 0.0]", 1))
+    with pytest.raises(ValueError, match=r"bad.yaml:10: `frame` is .*; it must be 4 x 4 numbers"):
+        load_scene("bad.yaml")
 
 
 def test_joints_without_names_draw_as_before_and_names_are_checked(tmp_path: Path, gripper: Path) -> None:
