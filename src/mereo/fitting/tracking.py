@@ -492,7 +492,9 @@ class Tracker:
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
         calibration = None if model is None else model.calibration
-        recognition = recognize(tracked.fitted.registration, calibration, stated_scene_unit=stated)
+        recognition = recognize(
+            tracked.fitted.registration, calibration, stated_scene_unit=stated, has_weights=model is not None
+        )
         recognition = recognition.doubted(frame.seen.doubt)
         seen = in_registered_unit(frame.seen, self.registrar, tracked.fitted.registration, recognition)
         return Answer(
@@ -515,7 +517,7 @@ class Tracker:
         if alone is None or alone.model is None:
             hypothesis = Reading.of_all(frame.seen.cloud)
             alone = Answer(frame.seen, None, self.registrar, hypothesis, self._T_camera_input, located_by="search")
-        recognition = Recognition(False, reason, MOST)
+        recognition = Recognition(False, reason, MOST, has_weights=alone.model is not None)
         return replace(alone, recognition=recognition, tracking="lost", seconds=time.perf_counter() - started)
 
 
