@@ -641,45 +641,30 @@ def test_fingers_that_nothing_shows_are_where_the_encoder_says_in_each_frame(
     assert unseen.interval is not None and np.ptp(unseen.interval) > 0.002, "of which nothing is given"
 
 
-@pytest.fixture
-def following(known: mereo.Object, gripper: Path, working_folder: Path, capsys: pytest.CaptureFixture) -> Any:
-    """Clouds of a moving gripper, and what a stream of them prints and says, with a source of joints."""
-    assert known.scene is not None
-    Path("frames").mkdir()
-    true = [write_frame(Path(f"frames/{i}.ply"), known.scene, [0.4 + 0.1 * i], 5)[0] for i in range(3)]
-
-    def stream(source: Path, joints: str, *options: object) -> tuple[list[Any], str]:
-        run_mereo("stream", source, "--object", gripper, "--every-frame", "--joints", joints, *options)
-        printed = capsys.readouterr()
-        return [*map(json.loads, printed.out.splitlines())], printed.err
-
-    return true, stream
-
-
-def test_a_stream_reads_the_joints_of_each_frame(following: Any) -> None:
-    true, stream = following
-    Path("joints").mkdir()
-    Path("joints/0.yaml").write_text(f"finger: {true[0]}")
-    Path("joints/2.json").write_text(f'{{"finger": {true[2]}}}')
-    lines, _ = stream(Path("frames"), "joints", "--unit-m", "1")
-    assert lines.pop(1)["error"] == "joints/1.yaml does not exist; a file of joints is needed: check the path"
-    for line, value in zip(lines, true[::2], strict=True):
-        assert_allclose(line["joints"]["finger"]["interval"], value, atol=1e-6)
-
-
-def test_a_stream_reads_the_joints_that_a_recording_has(following: Any) -> None:
+def test_a_stream_reads_the_joints_of_each_frame_from_a_folder_or_a_recording(
+    known: mereo.Object, gripper: Path, working_folder: Path, capsys: pytest.CaptureFixture
+) -> None:
     bags = pytest.importorskip("recorded_bags", reason="rosbags comes with the extra sensors")
-    (true, *_), stream = following
+    for folder in ("frames", "joints"):
+        Path(folder).mkdir()
+    assert known.scene is not None
+    true = [write_frame(Path(f"frames/{i}.ply"), known.scene, [0.4 + 0.1 * i], 5)[0] for i in range(3)]
+    for i in (0, 2):
+        Path(f"joints/{i}.yaml").write_text(f"finger: {true[i]}")
     points = trimesh.load("frames/0.ply").vertices
-    bag = bags.write_bag(
-        Path("robot.mcap"),
-        2,
-        lambda make: {
-            "/points": [make.cloud(points[len(points) % 2 :])] * 3,
-            "/joint_states": [make.joints(wheel=1.0, finger=true)],
-        },
-    )
-    for line in stream(bag, "/joint_states")[0][1:]:  # the first is as early as the values
-        assert_allclose(line["joints"]["finger"]["interval"], true, atol=1e-6)
+
+    def topics(make: Any) -> Any:
+        states = [make.joints(["wheel", "finger"], [1.0, true[0]])]
+        return {"/points": [make.cloud(points[len(points) % 2 :])] * 3, "/joint_states": states}
+
+    bag, options = bags.write_bag(Path("robot.mcap"), 2, topics), ("--object", gripper, "--every-frame", "--joints")
+    run_mereo("stream", "frames", *options, "joints", "--unit-m", "1")
+    run_mereo("stream", bag, *options, "/joint_states")
+    lines = [*map(json.loads, capsys.readouterr().out.splitlines())]
+    assert lines.pop(1)["error"] == "joints/1.yaml does not exist; a file of joints is needed: check the path"
+    del lines[2]  # the recording's first frame is as early as the values
+    intervals = [line["joints"]["finger"]["interval"] for line in lines]
+    assert_allclose(intervals, np.repeat([[true[i]] for i in (0, 2, 0, 0)], 2, axis=1), atol=1e-6)
+    assert run_mereo("stream", bag, *options, "/wheels") == 2
     sentence = "has no joint states on topic '/wheels'; those it has are on: /joint_states"
-    assert sentence in stream(bag, "/wheels")[1]
+    assert sentence in capsys.readouterr().err

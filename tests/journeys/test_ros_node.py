@@ -154,10 +154,10 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     depth = add_depth_noise(render_depth(mesh, CAMERA), 2e-4, default_rng(0)).depth
     node, frame = ros.ObjectTracker(), image(depth, 5.5)
     node._keep_info(INFO)
-    (kind, topic, keep, _), *_ = (call.args for call in node.create_subscription.call_args_list)
-    assert (kind.__name__, topic) == ("JointState", "joint_states")
-    for time_s, name, value in ((5.3, "finger", 0.03), (5.48, "finger", 0.0203), (5.5, "wheel", 1.0), (9, "finger", 0)):
-        keep(kind(header=header(time_s), name=[name], position=[float(value)]))
+    kind, topic, keep, _ = node.create_subscription.call_args_list[0].args
+    assert topic == "joint_states"
+    for time_s, name, value in ((5.3, "finger", 0.03), (5.48, "finger", 0.0203), (5.5, "wheel", 1.0)):
+        keep(kind(header=header(time_s), name=[name], position=[value]))
     node.answer(frame)
     assert all(each.header.stamp is frame.header.stamp for each in node.sent if "header" in vars(each))
     sent = taken(node)

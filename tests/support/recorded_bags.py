@@ -63,10 +63,8 @@ class Messages:
             **values,
         )  # fmt: skip
 
-    def joints(self, **values: float) -> Any:
-        empty, position = np.empty(0), np.array([*values.values()])
-        kind = self.types["sensor_msgs/msg/JointState"]
-        return kind(header=self.header(), name=[*values], position=position, velocity=empty, effort=empty)
+    def joints(self, names: list[str], values: list[float]) -> Any:
+        return self.types["sensor_msgs/msg/JointState"](self.header(), names, np.array(values), *[np.empty(0)] * 2)
 
     def cloud(self, points: ndarray) -> Any:
         """Two rows; x, y, z as floats after four bytes of something else, and four of padding at the end of a row."""

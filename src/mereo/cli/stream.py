@@ -364,19 +364,9 @@ def _of_message(message: RecordedFrame, source: str, reading: InputConfig, isola
     return StreamFrame(message.name, message.time_s, _loader(read, isolation), message.joints)
 
 
-JOINT_SUFFIXES = (".yaml", ".json")
-"""Of files of joints in a folder that has one for each frame."""
-
-
 def with_joint_files(frames: Iterable[StreamFrame | None], folder: Path) -> Frames:
-    """Frames whose joints' values are in files of a folder, each of its frame's name but for the ending."""
-    return (frame and replace(frame, joints=partial(_joint_file, folder, frame.name)) for frame in frames)
-
-
-def _joint_file(folder: Path, name: str) -> Path:
-    """File of a frame's joints, which need not be there."""
-    first, *others = (folder / f"{Path(name).stem}{suffix}" for suffix in JOINT_SUFFIXES)
-    return next((file for file in others if file.is_file()), first)
+    """Frames whose joints' values are in files of a folder, ``0000.yaml`` of the frame ``0000.png``."""
+    return (frame and replace(frame, joints=partial(Path, folder, f"{Path(frame.name).stem}.yaml")) for frame in frames)
 
 
 def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Any]:
