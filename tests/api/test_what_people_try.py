@@ -353,6 +353,28 @@ def test_a_folder_is_loaded_as_it_was_saved(kind: str, results: Results, tmp_pat
         mereo.load_result(folder)
 
 
+@pytest.mark.usefixtures("small_previews")
+@pytest.mark.parametrize("kind", ANSWERED)
+def test_what_was_loaded_is_transformed_saved_and_carries_as_the_result_does(
+    kind: str, results: Results, tmp_path: Path
+) -> None:
+    whole, moved = results[kind], results[kind].transformed(T_BASE)
+    known = mereo.Object(None, model=whole.registrar.model) if kind in FITTED else None
+    stored = mereo.load_result(whole.save(tmp_path / "whole"), known).transformed(T_BASE)
+    again = mereo.load_result(stored.save(tmp_path / "again", millimetres=True), known)
+    near = partial(assert_allclose, rtol=1e-4, atol=1e-5 * np.ptp(moved.surfaces.merged()[0]))
+    assert again.facts.keys() == moved.to_dict().keys() and again.facts["frame"] == "other"
+    for one, other in zip(again, moved, strict=True):
+        near([one.centroid, *one.mesh.bounds], [other.centroid, *other.mesh.bounds])
+    if known is not None:
+        near([again.carry(np.eye(4)), again["base"].pose], [moved.carry(np.eye(4)), moved["base"].pose])
+        near(again.covariance, moved.covariance, atol=1e-6)
+    with pytest.raises(ValueError, match="^a stored result holds no model of its object"):
+        mereo.load_result(tmp_path / "again").carry(np.eye(4))
+    with pytest.raises(ValueError, match="a.png shows the observed points, which a stored result does not have"):
+        stored.save(tmp_path / "a.png")
+
+
 def test_a_lost_object_says_so_in_every_form(results: Results) -> None:
     lost = results["lost"]
     facts = lost.to_dict()

@@ -1,5 +1,6 @@
 """Is it my object, in a state that I know: each sign has its say, together they decide, and one gives the reason."""
 
+import re
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -59,6 +60,8 @@ def test_each_sign_has_its_say(
     said = recognize(replace(registration, **changes), **options)
     assert said.known is not True and said.reason is not None and sentence in said.reason
     assert said.description is not None and said.description.endswith(said.reason)
+    without = recognize(replace(registration, **changes), **options, has_weights=False)
+    assert not re.search("weights|learn", str(without.description)) and without.strangeness == said.strangeness
 
 
 def test_the_more_is_wrong_the_less_is_known(registration: Registration) -> None:

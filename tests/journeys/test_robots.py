@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from math import pi
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,9 +25,11 @@ import mereo.__main__ as command_line
 from mereo.cli.stream import FrameAnswer
 from mereo.deformation.samplers import RandomMotion
 from mereo.fitting.problem.residuals import are_near
+from mereo.fitting.tracking import SynchronousExecutor
 from mereo.geometry.camera import Camera
 from mereo.geometry.conventions import Range
 from mereo.geometry.mesh_check import examine
+from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import inverse_rigid, rigid
 from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
@@ -57,8 +60,13 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gripper(tmp_path_factory.mktemp("robots"))
 
 
-def write_frame(path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128) -> list[float]:
-    """Write the noisy depth cloud in metres of free joints at shares of their ranges; returns the values."""
+def write_frame(
+    path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128, seen_parts: int = 99
+) -> list[float]:
+    """Write the noisy depth cloud in metres of free joints at shares of their ranges; returns the values.
+
+    Of segments after the first ``seen_parts`` nothing is seen.
+    """
     motion = scene.sample_deformations
     assert isinstance(motion, RandomMotion) and scene.unit_m is not None
     leaders = [joint for joint, _ in motion.joints.values() if not joint.follows]
@@ -67,7 +75,9 @@ def write_frame(path: Path, scene: Scene, shares: Sequence[float], seed: int, pi
     rng = default_rng(seed)
     seen = mesh.transformed(inverse_rigid(scene.workspace.sample(rng, mesh.bounds.mean(axis=0))))
     image = add_depth_noise(render_depth(seen, Camera.from_fov(pixels, pixels, scene.workspace.fov_rad)), 0.1, rng)
-    write_positions_ply(path, image.to_points().points * scene.unit_m)
+    points = image.to_points().points
+    points = points[Solids(seen).nearest(points).owner < seen_parts]
+    write_positions_ply(path, points * scene.unit_m)
     values = [joint.limits[0] + share * np.ptp(joint.limits) for joint, share in zip(leaders, shares, strict=True)]
     return [float(value) * (1 if leaders[0].turns else scene.unit_m) for value in values]  # all turn, or all slide
 
@@ -257,6 +267,12 @@ def test_shells_of_a_link_that_overlap_are_no_fault_and_a_repair_unites_them(
     assert "note: it intersects itself" in capsys.readouterr().out
     run_mereo("scene", "check", "laptop.yaml", "--repair")
     assert "repaired base: united 2 shells that overlap" in capsys.readouterr().out
+    before, after = (load_scene(f"laptop{end}.yaml").link_frames for end in ("", "-repaired"))
+    assert_array_equal([*after.values()], [*before.values()])
+    text = Path("laptop-repaired.yaml").read_text()
+    Path("bad.yaml").write_text(text.replace("- [1.0, 0.0, 0.0, 0.0]", "- [2.0, 0.0, 0.0, 0.0]", 1))
+    with pytest.raises(ValueError, match=r"bad.yaml:10: `frame` is .*; it must be 4 x 4 numbers"):
+        load_scene("bad.yaml")
 
 
 def test_joints_without_names_draw_as_before_and_names_are_checked(tmp_path: Path, gripper: Path) -> None:
@@ -604,3 +620,51 @@ def test_a_frame_that_contradicts_a_known_value_is_not_believed(known: mereo.Obj
     (true,) = write_frame(tmp_path / "frame.ply", known.scene, [0.4], 5)
     result = mereo.reconstruct(tmp_path / "frame.ply", known, unit_m=1.0, joints={"finger": true + 0.01})
     assert result.known is False and result.joints["finger"].value == pytest.approx(true + 0.01, abs=1e-12)
+
+
+def test_fingers_that_nothing_shows_are_where_the_encoder_says_in_each_frame(
+    known: mereo.Object, tmp_path: Path
+) -> None:
+    """Followed from the last frame's state, and found again by a search."""
+    assert known.scene is not None and known.joints == ("other finger", "finger")
+    frame, times = tmp_path / "frame.ply", (0.0, 0.1, 0.2, 0.3, 99.0)
+    with mereo.Tracker(known, executor=SynchronousExecutor()) as tracker:
+        for time_s, share, seen_parts in zip(times, (0.2, 0.4, 0.6, 0.8, 0.1), (3, 1, 1, 3, 3), strict=True):
+            (true,) = write_frame(frame, known.scene, [share], 5, seen_parts=seen_parts)
+            result = tracker.follow(frame, time_s, unit_m=1.0, extent="partial", joints={"finger": true})
+            assert result.tracking == ("followed" if 0 < time_s < 1 else "found") and result.known is True
+            assert result.joints["finger"].interval == pytest.approx((true, true), abs=1e-9)
+            for name, x in (("left", -0.01 - true), ("right", 0.01 + 0.5 * true + 0.002)):
+                assert_allclose(result[name].pose_in("palm")[:3, 3], [x, 0, 0.047], atol=2e-4)
+        (true,) = write_frame(frame, known.scene, [0.3], 5, seen_parts=1)
+        unseen = tracker.follow(frame, 99.1, unit_m=1.0, extent="partial").joints["finger"]
+    assert unseen.interval is not None and np.ptp(unseen.interval) > 0.002, "of which nothing is given"
+
+
+def test_a_stream_reads_the_joints_of_each_frame_from_a_folder_or_a_recording(
+    known: mereo.Object, gripper: Path, working_folder: Path, capsys: pytest.CaptureFixture
+) -> None:
+    bags = pytest.importorskip("recorded_bags", reason="rosbags comes with the extra sensors")
+    for folder in ("frames", "joints"):
+        Path(folder).mkdir()
+    assert known.scene is not None
+    true = [write_frame(Path(f"frames/{i}.ply"), known.scene, [0.4 + 0.1 * i], 5)[0] for i in range(3)]
+    for i in (0, 2):
+        Path(f"joints/{i}.yaml").write_text(f"finger: {true[i]}")
+    points = trimesh.load("frames/0.ply").vertices
+
+    def topics(make: Any) -> Any:
+        states = [make.joints(["wheel", "finger"], [1.0, true[0]])]
+        return {"/points": [make.cloud(points[len(points) % 2 :])] * 3, "/joint_states": states}
+
+    bag, options = bags.write_bag(Path("robot.mcap"), 2, topics), ("--object", gripper, "--every-frame", "--joints")
+    run_mereo("stream", "frames", *options, "joints", "--unit-m", "1")
+    run_mereo("stream", bag, *options, "/joint_states")
+    lines = [*map(json.loads, capsys.readouterr().out.splitlines())]
+    assert lines.pop(1)["error"] == "joints/1.yaml does not exist; a file of joints is needed: check the path"
+    del lines[2]  # the recording's first frame is as early as the values
+    intervals = [line["joints"]["finger"]["interval"] for line in lines]
+    assert_allclose(intervals, np.repeat([[true[i]] for i in (0, 2, 0, 0)], 2, axis=1), atol=1e-6)
+    assert run_mereo("stream", bag, *options, "/wheels") == 2
+    sentence = "has no joint states on topic '/wheels'; those it has are on: /joint_states"
+    assert sentence in capsys.readouterr().err

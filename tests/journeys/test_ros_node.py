@@ -146,7 +146,7 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     ros: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     robot = write_gripper(tmp_path)
-    monkeypatch.setattr(Node, "stated", {"object": str(robot)})  # or a list
+    monkeypatch.setattr(Node, "stated", {"object": str(robot), "known_joints": True})  # or a list
     T = rigid(Rotation.from_euler("xyz", [195, 30, 200], degrees=True).as_matrix(), np.array([0.0, 0.0, 0.45]))
     parts = zip(read_robot(robot).mesh.segments, (0.0, -0.02, 0.012), strict=True)  # the fingers are so far open
     moved = [SegmentedMesh((part,)).transformed(T @ rigid(np.eye(3), np.array([x, 0, 0]))) for part, x in parts]
@@ -154,6 +154,10 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     depth = add_depth_noise(render_depth(mesh, CAMERA), 2e-4, default_rng(0)).depth
     node, frame = ros.ObjectTracker(), image(depth, 5.5)
     node._keep_info(INFO)
+    kind, topic, keep, _ = node.create_subscription.call_args_list[0].args
+    assert topic == "joint_states"
+    for time_s, name, value in ((5.3, "finger", 0.03), (5.48, "finger", 0.0203), (5.5, "wheel", 1.0)):
+        keep(kind(header=header(time_s), name=[name], position=[value]))
     node.answer(frame)
     assert all(each.header.stamp is frame.header.stamp for each in node.sent if "header" in vars(each))
     sent = taken(node)
@@ -161,7 +165,7 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     right = T @ rigid(np.eye(3), np.array([0.012, 0, 0])) @ read_robot(robot).link_frames["right"]
     assert_allclose(sent["object/right"], right, atol=0.01)
     joints = dict(zip(sent["JointState"].name, sent["JointState"].position, strict=True))
-    assert joints == pytest.approx({"finger": 0.02, "other finger": 0.012}, abs=0.001)
+    assert joints == pytest.approx({"finger": 0.0203, "other finger": 0.01215}), "as is known at the frame's time"
     for marker, part in zip(sent["MarkerArray"].markers, mesh.segments, strict=True):
         corners = np.array([list(vars(each).values()) for each in marker.points])
         corners = transform_points(sent[marker.header.frame_id], corners)
@@ -221,7 +225,7 @@ def test_what_is_wrong_is_said_in_diagnostics(ros: Any, node: Any) -> None:
     assert silence.level == b"\3" and silence.message.startswith("no points for ")
     cloud = message("sensor_msgs/msg/PointCloud2")(header=header(4))
     node.answer(cloud)
-    node.tracker.follow.assert_called_with(cloud, 4.0, unit_m=1.0, drop_invalid=True)
+    node.tracker.follow.assert_called_with(cloud, 4.0, unit_m=1.0, joints=None, drop_invalid=True)
 
 
 def test_the_package_has_what_ros2_run_and_launch_need(ros: Any, node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,4 +249,4 @@ def test_the_package_has_what_ros2_run_and_launch_need(ros: Any, node: Any, monk
     assert all(Path(file).is_file() for _, files in tools.setup.call_args.kwargs["data_files"] for file in files)
     runpy.run_path("launch/mereo.launch.py")["generate_launch_description"]()
     remapped = {name for name, _ in tools.Node.call_args.kwargs["remappings"]}
-    assert remapped == {"points", *(call.args[1] for call in node.create_subscription.call_args_list)}
+    assert remapped == {"points", "joint_states", *(call.args[1] for call in node.create_subscription.call_args_list)}

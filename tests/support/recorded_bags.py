@@ -63,6 +63,9 @@ class Messages:
             **values,
         )  # fmt: skip
 
+    def joints(self, names: list[str], values: list[float]) -> Any:
+        return self.types["sensor_msgs/msg/JointState"](self.header(), names, np.array(values), *[np.empty(0)] * 2)
+
     def cloud(self, points: ndarray) -> Any:
         """Two rows; x, y, z as floats after four bytes of something else, and four of padding at the end of a row."""
         field = self.types["sensor_msgs/msg/PointField"]

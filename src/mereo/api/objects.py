@@ -32,8 +32,8 @@ from mereo.models.config import InferenceConfig
 from mereo.models.trained import Trained
 from mereo.models.weights_place import has_network, is_weights, statistical_model_in
 from mereo.scenes.files.object_files import SCENE, names_scene, scene_of_folder, scene_of_meshes, shapes_in
-from mereo.scenes.parameters import parameters, random_state, with_joints
-from mereo.scenes.random_states import OBJECT_STATES, STATES_SEED, kept_model, scene_model
+from mereo.scenes.parameters import narrowed_model, with_joints
+from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
@@ -86,6 +86,11 @@ class Object:
     def names(self) -> Names:
         """Names of the segments, in the order of their labels."""
         return self.segments.names
+
+    @property
+    def joints(self) -> Names:
+        """Names of its joints, whose values results have, and ``with_joints`` takes."""
+        return tuple(getattr(self.scene and self.scene.sample_deformations, "joints", ()))
 
     @property
     def segments(self) -> "Trained | SegmentedMesh":
@@ -142,14 +147,11 @@ class Object:
         scene = with_joints(self.scene, joints)
         motion = scene.sample_deformations
         assert isinstance(motion, RandomMotion)
-        moved = [joint for joint, _ in motion.joints.values()]
-        key = tuple(joint.shares for joint in moved)
+        key = tuple(joint.shares for joint, _ in motion.joints.values())
         if key not in self._narrowed:
             self._narrowed.clear()
-            rests = all(joint.shares[0] <= joint.share(0.0) <= joint.shares[1] for joint in moved)
-            states = OBJECT_STATES if parameters(random_state(scene, STATES_SEED)) else 2
             with stage("make the statistical model of the states that the given joints leave"):
-                model = replace(scene_model(scene, states), rests=rests)
+                model = narrowed_model(scene, self.model or kept_model(scene))
             self._narrowed[key] = self._moved_by(model, scene)
         return self._narrowed[key]
 

@@ -42,6 +42,7 @@ from mereo.reconstruction.observation import (
     find_object,
     size_warning,
 )
+from mereo.scenes.parameters import with_joints
 from mereo.synthesis.sample_views import shipped_frame, shipped_frames
 
 Isolation = IsolationConfig | Mapping[str, Any] | None
@@ -346,13 +347,14 @@ class Tracker:
             executor: what searches for a lost object; by default a thread of the tracker's own.
             isolation: what of each frame is left out, as in ``reconstruct``.
             initial_pose: rough pose of the object in the first frame, as in ``reconstruct``.
-            joints: values that are known and stay as they are, as in ``reconstruct``.
+            joints: values that are known and stay as they are, as in ``reconstruct``; ``follow`` takes others.
 
         Raises ``ValueError`` for other methods and poses, and for weights without a deformation model.
         """
         self._isolation, _ = split_options(isolation, {})
         self._initial_pose = None if initial_pose is None else checked_pose(initial_pose)
-        registrar = None if method == "network" else object_of(object, joints).registrar(method)
+        known = object_of(object, joints)
+        registrar, self._scene = None if method == "network" else known.registrar(method), known.scene
         if registrar is None or method == "full":
             raise ValueError(
                 f'the method is {method!r}, and only the modes of a deformation model can be followed: take "auto" '
@@ -366,6 +368,7 @@ class Tracker:
         time_s: float,
         *,
         isolation: Isolation = None,
+        joints: object = None,
         **options: Any,
     ) -> Result:
         """Find the object in the next frame.
@@ -374,6 +377,7 @@ class Tracker:
             frame: whatever ``load_frame`` takes, or what it has returned; in one unit throughout the sequence.
             time_s: of the frame, seconds from any zero, later than the last one's.
             isolation: what of the frame is left out, where that is not as of the tracker.
+            joints: values that are known at that time, as in ``reconstruct``.
             options: as in ``reconstruct``: fields of ``isolation`` by themselves, and arguments of ``load_frame``.
 
         Raises ``ValueError`` for unusable frames, after which the sequence may go on. Surfaces, labels and figures are
@@ -384,7 +388,8 @@ class Tracker:
             seen = observation_of(frame, isolation, reading)
             if self._initial_pose is not None:
                 seen = replace(seen, initial_pose=self._initial_pose)
-            answer = self._tracker.follow(seen, time_s, keep_all=isolation.keep_all)
+            scene = None if joints is None else with_joints(self._scene, joints)
+            answer = self._tracker.follow(seen, time_s, keep_all=isolation.keep_all, scene=scene)
         self._initial_pose = None
         return Result.of(answer)
 

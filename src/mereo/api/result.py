@@ -25,9 +25,12 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.typing import ArrayLike
 
+from mereo.api.objects import Object, Source, object_of
 from mereo.api.words import python_words
 from mereo.fitting.registration.answer import Answer
+from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
+from mereo.geometry.camera import PointCloud
 from mereo.geometry.conventions import Facts, Names, WholeNumbers
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import EMPTY_MESH, Segment, SegmentedMesh
@@ -42,11 +45,13 @@ from mereo.io.point_arrays import mesh_of, model_points, parts_of_scene
 from mereo.io.readers import read_arrays
 from mereo.io.ros_recordings import is_recording
 from mereo.io.sensor_frame import SensorFrame
-from mereo.io.writers.formats import WRITERS, chosen_formats
+from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats, write_single
+from mereo.io.writers.glb import GLTF_CAMERA_ROTATION
 from mereo.io.writers.volumes import MM_PER_M
-from mereo.reconstruction.pipeline import Reconstruction, described
+from mereo.reconstruction.pipeline import Reconstruction, along_axes, described
 from mereo.results.carry import carry, place
 from mereo.results.joints import JointValues, measure_joints, pose_covariance, segment_poses
+from mereo.results.state import STATE, RegistrationState, read_state, restored, save_state
 from mereo.visualization.reconstruction_report import result_html, stated_joints
 from mereo.visualization.result_files import (
     INSTANCE,
@@ -196,6 +201,94 @@ class SegmentedResult(ABC):
         """
         return {segment.name: segment.to_open3d() for segment in self if segment.is_present}
 
+    @python_words()
+    def carry(self, what: Any, files: CarryFrame = "source") -> Any:
+        """Carry points, poses, a mesh or a file of the object's own frame and unit to where it is now.
+
+        Args:
+            what: points (whatever ``load_frame`` takes of points), which come back as an array [n, 3], of one point
+                [3]; rigid poses 4 x 4 or n x 4 x 4, which turn as their surroundings; a mesh of trimesh or Open3D,
+                ``Segment``, ``SegmentedMesh`` or (vertices, faces), which comes back as its kind, with edges short
+                enough to bend; a dict of these, or a scene of trimesh, as a dict; or the path of a file as of
+                ``--carry``, a volume included, which comes back as a ``CarriedFile``.
+            files: frame and unit of it: "source" is that of the object's own files, "scene" that of its scene; "RAS"
+                and "LPS" state the space of the object's own files, where these do not name it.
+
+        Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and
+        for what lies too far from the object to belong to it.
+        """
+        check_value("files", files, CarryFrame, "source")
+        what = parts_of_scene(what)
+        if isinstance(what, Mapping):
+            return {name: self.carry(each, files) for name, each in what.items()}
+        registrar, registered, frame = self._carrier()
+        (placed,) = place([_attachment(what)], registrar, files)
+        carried = carry(placed, registered)
+        content = carried.content
+        if isinstance(what, AnyPath):
+            return CarriedFile(carried.name, content, carried.inside, carried.farthest, frame)
+        if isinstance(content, PoseTable):
+            assert content.rotations is not None
+            poses = np.stack([rigid(*each) for each in zip(content.rotations, content.points, strict=True)])
+            return poses.reshape(_shape(what))
+        if isinstance(content, Positions):
+            return content.points[0] if _shape(what) == (3,) else content.points
+        assert isinstance(content, Surfaces)
+        return _as_kind_of(what, content.mesh)
+
+    @python_words()
+    def save(
+        self,
+        path: str | Path | None = None,
+        *,
+        formats: Sequence[Format] | None = None,
+        millimetres: bool = False,
+        overwrite: bool = False,
+    ) -> Path:
+        """Write a folder of results as ``mereo reconstruct`` does, or one file; returns its path.
+
+        Args:
+            path: a folder to create, by default result, result2, ...; or a file whose suffix says what it is: .glb,
+                .ply (surfaces), .npz, .vti, .nii.gz, .seg.nrrd (labels), .json (the figures), .html (the report), .png
+                (the preview).
+            formats: files of a folder besides report and preview, as ``--formats``; "points" needs
+                ``reconstruct(..., label_points=True)``.
+            millimetres: write .ply, .vti and other files that have no unit in millimetres, not in the frame's unit.
+            overwrite: replace a folder that mereo wrote, and nothing else is in, or a file that no input is.
+
+        Raises ``FileExistsError`` for what exists, unless ``overwrite`` may replace it; ``ValueError`` for a suffix or
+        a format that there is none of, and ``ImportError`` where a format's extra is missing.
+        """
+        path = free_folder() if path is None else checked_path(path, "path")
+        suffix = file_suffix(path)
+        if suffix == "":
+            _check_list(formats)
+            wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
+            with new_directory(path, overwrite, self._read()) as directory:
+                self._write_folder(directory, FilesConfig(wanted, millimetres))
+        elif formats is not None:
+            raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats")
+        else:
+            with atomic_file(path, force=overwrite, inputs=self._read()) as partial:
+                self._write_file(partial, suffix, FilesConfig((), millimetres))
+        return path
+
+    @abstractmethod
+    def _carrier(self) -> tuple[Registrar, Registration, SensorFrame]:
+        """Registrar of the object, its registration, and the frame whose axes that is in."""
+
+    @abstractmethod
+    def _write_folder(self, directory: Path, files: FilesConfig) -> None:
+        """Write what a folder of results has."""
+
+    @abstractmethod
+    def _write_file(self, path: Path, suffix: str, files: FilesConfig) -> None:
+        """Write one file."""
+
+    def _read(self) -> list[Path]:
+        """Files that this was made from."""
+        return []
+
 
 SINGLE = (".glb", ".ply", ".npz", ".vti", ".nii.gz", ".seg.nrrd", ".json", ".html", ".png")
 """Suffixes of the files that ``Result.save`` writes alone."""
@@ -330,7 +423,8 @@ class Result(Answer, SegmentedResult):
     def __reduce__(self) -> Any:
         """Values of the result, without what computes further ones."""
         parts = (None, None) if self.is_missing else (self.surfaces, self.labels)
-        return StoredResult, (self.to_dict(), *parts, self.instances[1:])
+        frame = replace(self.seen.frame, cloud=NOTHING, depth=None, whole=None)
+        return StoredResult, (self.to_dict(), *parts, frame, self.instances[1:])
 
     def __copy__(self) -> "Result":
         return self
@@ -338,78 +432,16 @@ class Result(Answer, SegmentedResult):
     def __deepcopy__(self, memo: Any) -> "Result":
         return self
 
-    @python_words()
-    def carry(self, what: Any, files: CarryFrame = "source") -> Any:
-        """Carry points, poses, a mesh or a file of the object's own frame and unit to where it is now.
-
-        Args:
-            what: points (whatever ``load_frame`` takes of points), which come back as an array [n, 3], of one point
-                [3]; rigid poses 4 x 4 or n x 4 x 4, which turn as their surroundings; a mesh of trimesh or Open3D,
-                ``Segment``, ``SegmentedMesh`` or (vertices, faces), which comes back as its kind, with edges short
-                enough to bend; a dict of these, or a scene of trimesh, as a dict; or the path of a file as of
-                ``--carry``, a volume included, which comes back as a ``CarriedFile``.
-            files: frame and unit of it: "source" is that of the object's own files, "scene" that of its scene; "RAS"
-                and "LPS" state the space of the object's own files, where these do not name it.
-
-        Raises ``ValueError`` where the answer is the network's, where the frame of the object's files is not known, and
-        for what lies too far from the object to belong to it.
-        """
-        check_value("files", files, CarryFrame, "source")
-        what = parts_of_scene(what)
-        if isinstance(what, Mapping):
-            return {name: self.carry(each, files) for name, each in what.items()}
-        attachment, registered = _attachment(what), registration_of(self)
+    def _carrier(self) -> tuple[Registrar, Registration, SensorFrame]:
+        registered = registration_of(self)
         assert self.registrar is not None
-        (placed,) = place([attachment], self.registrar, files)
-        carried = carry(placed, registered)
-        content = carried.content
-        if isinstance(what, AnyPath):
-            return CarriedFile(carried.name, content, carried.inside, carried.farthest, self.seen.frame)
-        if isinstance(content, PoseTable):
-            assert content.rotations is not None
-            poses = np.stack([rigid(*each) for each in zip(content.rotations, content.points, strict=True)])
-            return poses.reshape(_shape(what))
-        if isinstance(content, Positions):
-            return content.points[0] if _shape(what) == (3,) else content.points
-        assert isinstance(content, Surfaces)
-        return _as_kind_of(what, content.mesh)
+        return self.registrar, registered, self.seen.frame
 
-    @python_words()
-    def save(
-        self,
-        path: str | Path | None = None,
-        *,
-        formats: Sequence[Format] | None = None,
-        millimetres: bool = False,
-        overwrite: bool = False,
-    ) -> Path:
-        """Write a folder of results as ``mereo reconstruct`` does, or one file; returns its path.
+    def _write_folder(self, directory: Path, files: FilesConfig) -> None:
+        write_answer(directory, self, files)
 
-        Args:
-            path: a folder to create, by default result, result2, ...; or a file whose suffix says what it is: .glb,
-                .ply (surfaces), .npz, .vti, .nii.gz, .seg.nrrd (labels), .json (the figures), .html (the report), .png
-                (the preview).
-            formats: files of a folder besides report and preview, as ``--formats``; "points" needs
-                ``reconstruct(..., label_points=True)``.
-            millimetres: write .ply, .vti and other files that have no unit in millimetres, not in the frame's unit.
-            overwrite: replace a folder that mereo wrote, and nothing else is in, or a file that no input is.
-
-        Raises ``FileExistsError`` for what exists, unless ``overwrite`` may replace it; ``ValueError`` for a suffix or
-        a format that there is none of, and ``ImportError`` where a format's extra is missing.
-        """
-        path = free_folder() if path is None else checked_path(path, "path")
-        suffix = file_suffix(path)
-        if suffix == "":
-            _check_list(formats)
-            wanted = chosen_formats(DEFAULT_FILES.formats if formats is None else formats)
-            with new_directory(path, overwrite, self._read()) as directory:
-                write_answer(directory, self, FilesConfig(wanted, millimetres))
-        elif formats is not None:
-            raise ValueError(f"{path} is one file, whose suffix says its format: leave out formats")
-        else:
-            with atomic_file(path, force=overwrite, inputs=self._read()) as partial:
-                write_answer_file(partial, suffix, self, FilesConfig((), millimetres))
-        return path
+    def _write_file(self, path: Path, suffix: str, files: FilesConfig) -> None:
+        write_answer_file(path, suffix, self, files)
 
     @python_words()
     def show(self, *, port: int | None = None, block: bool | None = None) -> "OpenPage":
@@ -429,7 +461,6 @@ class Result(Answer, SegmentedResult):
         return open_answer(self, port or 0).stay(block)
 
     def _read(self) -> list[Path]:
-        """Files that this was made from."""
         paths = [self.seen.frame.path, *([] if self.model is None else [Path(self.model.name)])]
         return [path for path in paths if path.is_file() or is_recording(path)]
 
@@ -556,6 +587,17 @@ def _as_kind_of(what: Any, mesh: SegmentedMesh) -> Any:
     return type(what)(segment.vertices, segment.faces, process=False)
 
 
+NO_MODEL = (
+    "a stored result holds no model of its object, along which things move: give it where the folder is loaded, "
+    "load_result(folder, object)"
+)
+
+NOTHING = PointCloud(np.zeros((0, 3)))
+"""Points of a stored result."""
+
+DRAWN = (".html", ".png")
+"""Suffixes of files that show the observed points."""
+
 NO_REGISTRATION = (
     "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
     "cloud what is not the object, or take the registered model in any case with --method modes"
@@ -609,20 +651,26 @@ class StoredResult(SegmentedResult):
     """Result as a folder or a pickle has it: values in the axes and unit that it was in, and nothing that computes.
 
     ``unit_m``, ``known``, ``explained``, ``residual``, ``model_scale``, ``pose``, ``covariance`` and ``joints`` are as
-    of ``Result``. It is not transformed, and what needs the object's model it does not have: ``carry``, distances and
-    rest positions of points, radii of single ones (``mereo.results.state.load_state`` restores that).
+    of ``Result``, and so are ``transformed``, ``save``, without what needs the observed points or the radii of single
+    ones, and ``carry``, where ``load_result`` was given the object.
 
     Attributes:
         facts: content of ``summary.json``.
         surfaces: of all segments; None where the object was lost without an answer.
         labels: label grid; None likewise.
+        frame: its coordinates, without points.
         further: results of further instances of the object in the same frame.
+        state: of the registration; None of a pickle, and where the network answered.
+        object: what was looked for, where that is known.
     """
 
     facts: JsonObject
     surfaces: SegmentedMesh | None
     labels: LabelGrid | None
+    frame: SensorFrame
     further: "tuple[StoredResult, ...]" = ()
+    state: RegistrationState | None = None
+    object: Object | None = None
 
     unit_m, known, model_scale = _fact("unit_m"), _fact("recognition", "known"), _fact("model_scale")
     explained, residual = _fact("registration", "explained"), _fact("registration", "residual")
@@ -651,22 +699,83 @@ class StoredResult(SegmentedResult):
         """As ``Result.to_dict``."""
         return deepcopy(self.facts)
 
+    @python_words()
+    def transformed(self, T_new_frame: ArrayLike) -> "StoredResult":
+        """As ``Result.transformed``."""
+        T = checked_pose(T_new_frame)
+        facts, surfaces, labels, state = self.to_dict(), self.surfaces, self.labels, self.state
+        further, frame = tuple(each.transformed(T) for each in self.further), self.frame.transformed(T)
+        facts |= {"frame": "other", "depth_m": None, "T_input_result": frame.T_input_result}
+        if surfaces is not None and labels is not None:
+            surfaces = surfaces.transformed(T)
+            labels = along_axes(surfaces, labels)
+            for row, part in zip(facts["segments"], surfaces.segments, strict=True):
+                row["centroid"] = transform_points(T, _numbers(row["centroid"]))
+                row["box"] = part.bounds if len(part.faces) else row["box"]
+                row["voxels"] = (labels.labels == row["label"]).sum()
+        if self.pose is not None:
+            for each in (facts, *facts["segments"]):
+                each["pose"] = T @ each["pose"]
+        if self.covariance is not None:
+            turn = np.kron(np.eye(2), T[:3, :3])
+            facts["pose_covariance"] = turn @ self.covariance @ turn.T
+        if further:
+            facts["further_instances"] = [each.facts for each in further]
+        if state is not None:
+            state = state.seen_from(np.array(state.T_camera_input) @ inverse_rigid(T))
+        return StoredResult(to_json(facts), surfaces, labels, frame, further, state, self.object)
+
+    def _carrier(self) -> tuple[Registrar, Registration, SensorFrame]:
+        if self.object is None or self.state is None:
+            raise ValueError(NO_MODEL)
+        registrar = self.object.registrar("modes")
+        assert registrar is not None
+        registration = restored(self.state, registrar.model, self.object.scene)
+        return registrar, registration.moved(inverse_rigid(np.array(self.state.T_camera_input))), self.frame
+
+    def _results(self, files: FilesConfig) -> Results:
+        if self.surfaces is None or self.labels is None:
+            raise ValueError(self.facts["recognition"]["reason"])
+        to_viewer, unit_m = to_viewer_of(self.frame), self.frame.metres
+        return Results(self.surfaces, self.labels, None, to_viewer, unit_m, files.millimetres, self.facts)
+
+    def _write_folder(self, directory: Path, files: FilesConfig) -> None:
+        write_formats(directory, chosen_formats(files.formats), self._results(files))
+        if self.state is not None:
+            save_state(directory / STATE, self.state)
+        for number, each in enumerate(self.further, start=2):
+            (directory / INSTANCE.format(number)).mkdir()
+            each._write_folder(directory / INSTANCE.format(number), files)
+
+    def _write_file(self, path: Path, suffix: str, files: FilesConfig) -> None:
+        if suffix in DRAWN:
+            raise ValueError(
+                f"{path.name} shows the observed points, which a stored result does not have: copy that of its folder, "
+                "or reconstruct the frame again"
+            )
+        write_single(path, suffix, self._results(files))
+
     def __repr__(self) -> str:
         present = sum(segment.is_present for segment in self)
         return f"StoredResult({self.facts['title']!r}: {present} of {len(self)} segments; known: {self.known})"
 
 
 @python_words()
-def load_result(folder: str | Path) -> StoredResult:
+def load_result(folder: str | Path, object: Source = None) -> StoredResult:
     """Load a result from the folder that ``Result.save`` or ``mereo reconstruct`` has written.
 
-    It needs summary.json, segments.glb and labels.npz, which are written by default; surfaces have the 7 digits of
-    their file. Nothing in the folder is run. Raises ``FileNotFoundError`` where a file is missing, and ``ValueError``
-    where one is damaged, or they do not belong together.
+    Args:
+        folder: it needs summary.json, segments.glb and labels.npz, which are written by default; surfaces have the 7
+            digits of their file. Nothing in it is run.
+        object: what was looked for, from ``load_object``, or whatever that takes; only ``carry`` needs it.
+
+    Raises ``FileNotFoundError`` where a file is missing, and ``ValueError`` where one is damaged, they do not belong
+    together, or the object is another one.
     """
     folder = checked_path(folder, "folder")
     summary, surfaces, labels = (folder / WRITERS[name].file for name in ("json", "glb", "npz"))
-    meshes = {segment.name: segment for segment in read_glb(surfaces).mesh.segments}
+    glb, known = read_glb(surfaces), None if object is None else object_of(object)
+    meshes = {segment.name: segment for segment in glb.mesh.segments}
     with readable(labels, "label grid"):
         values, origin, spacing, names = map(read_arrays(labels).__getitem__, ("labels", "origin", "spacing", "names"))
         grid = LabelGrid(values, origin, spacing, tuple(names.tolist()))
@@ -679,7 +788,15 @@ def load_result(folder: str | Path) -> StoredResult:
             meshes.get(row["name"], Segment(row["name"], tuple(row["color"]), *EMPTY_MESH)) for row in facts["segments"]
         )
         mesh = SegmentedMesh(tuple(parts), tuple(map(tuple, facts["nested"])))
-        result = StoredResult(facts, mesh, grid)
+        turn = rigid(glb.rotation.T @ GLTF_CAMERA_ROTATION, np.zeros(3))
+        coordinates = SensorFrame(Path(facts["source"]), NOTHING, facts["unit_m"], "camera", T_result_seen=turn)
+        frame = replace(coordinates, T_input_result=_numbers(facts["T_input_result"]))
+        result = StoredResult(facts, mesh, grid, frame, object=known)
         _ = result.pose, result.covariance, result.joints, result.explained, repr(result)
-    places = (folder / INSTANCE.format(number) for number, _ in enumerate(facts.get("further_instances", ()), start=2))
-    return replace(result, further=tuple(map(load_result, places)))
+    numbers = range(2, 2 + len(facts.get("further_instances", ())))
+    further = tuple(load_result(folder / INSTANCE.format(number), known) for number in numbers)
+    state = read_state(folder) if known is not None or (folder / STATE).is_file() else None
+    result = replace(result, further=further, state=state)
+    if known is not None:
+        result._carrier()  # raises where the object is another one
+    return result

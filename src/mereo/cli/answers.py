@@ -153,7 +153,8 @@ class StreamCommand(FrameOptions):
         input: a folder of depth images or point clouds, a ROS recording, or - for file names on standard input;
             realsense for a camera that is connected, realsense:SERIAL for a certain one, realsense:FILE for a recording
             of its SDK: these need the extra `realsense`.
-        joints: file of joints whose values are known and stay as they are, as for `mereo reconstruct`.
+        joints: file of joints whose values are known and stay as they are, as for `mereo reconstruct`; or a folder of
+            such files, one for each frame, 0000.yaml for 0000.png; or a ROS recording's topic of JointState.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
         method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
             the network; network uses it alone, frame by frame; search leaves it out; modes takes the model in any case.

@@ -51,6 +51,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.results.joints import measure_joints, segment_poses
+from mereo.scenes.parameters import with_joints
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
 STANDARD_INPUT = "-"
@@ -68,11 +69,13 @@ class StreamFrame:
         name: for people: a file, a number.
         time_s: when it was recorded, from any zero.
         load: decodes it; called for frames that are answered only.
+        joints: reads the values of joints that are known at its time; None where none are.
     """
 
     name: str
     time_s: float
     load: Callable[[], Any]
+    joints: Callable[[], Any] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,12 +278,13 @@ def frames_of(
     isolation: IsolationConfig,
     rate_hz: float = 30.0,
     align_color: bool = False,
+    joints: str | None = None,
 ) -> Frames:
     """Frames of a source, in order; each is decoded when it is answered.
 
     A source is a folder of depth images or point clouds (in the order of their names, recorded at ``rate_hz``), a ROS
     recording, a RealSense camera (``camera_frames``, which also has ``align_color``), or ``-`` for names of files, one
-    a line, as they are written.
+    a line, as they are written. ``joints`` is the topic of a recording that has the joints' values of each frame.
 
     Raises ``FileNotFoundError``, or ``ValueError`` for a folder without frames, and what a camera raises.
     """
@@ -295,7 +299,7 @@ def frames_of(
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; a folder of frames or a ROS recording is needed, or -")
     if is_recording(path):
-        return (_of_message(message, source, reading, isolation) for message in read_messages(path, reading))
+        return (_of_message(message, source, reading, isolation) for message in read_messages(path, reading, joints))
     if not path.is_dir():
         raise ValueError(f"{path} is a single file; for one frame use `mereo reconstruct`, here name its folder")
     return (
@@ -357,7 +361,12 @@ def _named(reading: InputConfig, isolation: IsolationConfig) -> Iterator[StreamF
 
 def _of_message(message: RecordedFrame, source: str, reading: InputConfig, isolation: IsolationConfig) -> StreamFrame:
     read = partial(message_frame, message, Path(source), reading)
-    return StreamFrame(message.name, message.time_s, _loader(read, isolation))
+    return StreamFrame(message.name, message.time_s, _loader(read, isolation), message.joints)
+
+
+def with_joint_files(frames: Iterable[StreamFrame | None], folder: Path) -> Frames:
+    """Frames whose joints' values are in files of a folder, ``0000.yaml`` of the frame ``0000.png``."""
+    return (frame and replace(frame, joints=partial(Path, folder, f"{Path(frame.name).stem}.yaml")) for frame in frames)
 
 
 def _loader(read: Callable[[], SensorFrame], isolation: IsolationConfig) -> Callable[[], Any]:
@@ -390,12 +399,19 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
             f"{source} is a camera, which waits for no answer: leave out --every-frame, or record it first"
         )
     folder = None if command.surfaces is None else SurfaceFolder(command.surfaces, command.force)
+    joints, topic, steady = command.joints, None, None
+    if joints is not None and is_recording(Path(source)) and not joints.exists():
+        topic = str(joints)
     frames: Iterable[StreamFrame | None] = (
         watched_frames(source, reading, command.isolation)
         if command.watch
-        else frames_of(source, reading, command.isolation, command.rate, command.align_color)
+        else frames_of(source, reading, command.isolation, command.rate, command.align_color, topic)
     )
-    known = loaded_object(command)
+    if joints is not None and joints.is_dir():
+        frames = with_joint_files(frames, joints)
+    elif topic is None:
+        steady = joints
+    known = loaded_object(replace(command, joints=steady))
     answer = Answering(
         known.network,
         known.registrar(command.method),
@@ -537,6 +553,7 @@ class Answering:
         self.uncertainty, self.radius = uncertainty, radius
         executor = SynchronousExecutor() if waits else None
         self.tracker = None if registrar is None else Tracker(registrar, executor=executor)
+        self.scene = None if registrar is None else registrar.given
         self._size: Pair | None = None
 
     def __call__(self, frame: StreamFrame) -> FrameAnswer:
@@ -550,7 +567,8 @@ class Answering:
         if self.tracker is None:
             answer = answer_frame(at_point(seen, None), self.model, None, keep_all=self.keep_all)
         else:
-            answer = self.tracker.follow(seen, frame.time_s, keep_all=self.keep_all)
+            scene = None if frame.joints is None else with_joints(self.scene, frame.joints())
+            answer = self.tracker.follow(seen, frame.time_s, keep_all=self.keep_all, scene=scene)
         return FrameAnswer.of(replace(answer, resolution=self.resolution), self.uncertainty, self.radius)
 
     def close(self) -> None:

@@ -8,7 +8,7 @@ newest frame, begins a new track. The first frame waits for its search.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -39,6 +39,9 @@ from mereo.models.calibration import Calibration
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame
+from mereo.scenes.parameters import known_distances
+from mereo.scenes.scene import Scene
+from mereo.scenes.statistical_model import PairDistances, StatisticalModel
 
 # --- one frame's fit from the state of the frame before ---------------------------------------------------------------
 
@@ -131,8 +134,9 @@ def next_fit(
     cloud: CloudToFit,
     time_s: float,
     config: TrackConfig,
+    known: Sequence[PairDistances] = (),
 ) -> tuple[ModesFit, Track]:
-    """Fit the modes to a frame, and return the fit with the track that ends with it.
+    """Fit the modes to a frame of which distances are ``known``, and return the fit with the track that ends with it.
 
     Where the lines of sight of ``cloud`` leave it open, the object is seen whole or in part as it was when the track
     began; where it was seen whole and the frame rules that out by more than ``WHOLE``, it is fitted as seen in part
@@ -146,7 +150,7 @@ def next_fit(
         def fit(other_lines: SightKind) -> ModesFit:
             like = replace(cloud, lines=replace(lines, other_lines=other_lines))
             evidence = like.evidence(track.unit, config.observed_samples, config.points)
-            problem = track.problem.changed(evidence=evidence)
+            problem = track.problem.changed(evidence=evidence).with_distances(*known)
             posed = descend(problem, start, precision, config)
             return ModesFit(problem, track.unit, posed, 0.0, calibration=track.calibration)
 
@@ -241,9 +245,14 @@ class TrackedFrame:
     time_s: Number
     scene_unit: PositiveOrUnknown = None
     keep_all: bool = False
+    scene: Scene | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
+
+    def distances(self, model: StatisticalModel) -> tuple[PairDistances, ...]:
+        """What the scene says of the distances of a model's material points, where there is one."""
+        return () if self.scene is None else (known_distances(self.scene, model),)
 
 
 class SynchronousExecutor(Executor):
@@ -284,9 +293,9 @@ class BackgroundSearch:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
             executor = self._thread if self.executor is None else self.executor
-            arguments = frame.seen, self.registrar, frame.keep_all, frame.scene_unit
-            search = self.search or search_hypotheses
-            self._running = frame, executor.submit(lambda: search(*arguments)[0])
+            search, options = self.search or search_hypotheses, (frame.keep_all, frame.scene_unit)
+            searched = executor.submit(lambda: search(frame.seen, self.registrar.narrowed(frame.scene), *options)[0])
+            self._running = frame, searched
 
     def take(self) -> tuple[TrackedFrame, Candidate] | None:
         """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
@@ -361,7 +370,13 @@ class Tracker:
         self._search.close(wait=True)
 
     def follow(
-        self, seen: Observation, time_s: float, *, scene_unit: float | None = None, keep_all: bool = False
+        self,
+        seen: Observation,
+        time_s: float,
+        *,
+        scene_unit: float | None = None,
+        keep_all: bool = False,
+        scene: Scene | None = None,
     ) -> Answer:
         """Answer the next frame.
 
@@ -370,11 +385,12 @@ class Tracker:
             time_s: of the frame, from any zero; what is expected of the object depends on the time since the last one.
             scene_unit: length of a scene unit in the frame's unit, where it is known for certain.
             keep_all: take every point for the object's.
+            scene: the object's with the joints that are known in this frame (``with_joints``); None without any.
 
         The first frame is waited for, however long a search takes. Raises ``ValueError`` where that is unusable or,
         unless a network can answer, shows too little; of later frames the object is then lost, and the track is kept.
         """
-        started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all)
+        started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all, scene)
         tracked, why = self._tracked(self._track, frame, self.config.longest_s)
         if tracked is not None and not self._doubt(tracked):
             return self._gone_on(frame, tracked, started)
@@ -407,8 +423,10 @@ class Tracker:
         lines, kept = seen.lines.transformed(self._T_camera_input), cloud.rows(keep)
         near = CloudToFit(kept.points, outliers=points[~keep], lines=lines, normals=kept.normals)
 
+        known = frame.distances(track.problem.model)
+
         def fit(config: TrackConfig) -> _Tracked:
-            fitted, after = next_fit(track, near, time_s, config)
+            fitted, after = next_fit(track, near, time_s, config, known)
             return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
         tracked = fit(self.config)
@@ -423,7 +441,7 @@ class Tracker:
             return None
         before = self._T_camera_input, self._axes
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, earlier.seen.frame.axes
-        begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar.config)
+        begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar)
         area = 0.0 if self._track is None else self._track.area
         tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
         if tracked is not None and not self._doubt(tracked):
@@ -432,21 +450,20 @@ class Tracker:
         self._T_camera_input, self._axes = before
         return None
 
-    def _locate(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
+    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate, EncodedFrame]:
         """What of a frame is taken for the object, its best candidate, and what ``find`` returns besides."""
-        network = self.registrar.network
-        return frame.seen, *find(frame.seen, network, self.registrar, frame.keep_all, frame.scene_unit)
+        return frame.seen, *find(frame.seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
 
     def _by_itself(self, frame: TrackedFrame, started: float) -> Answer:
         """Answer a frame by itself, which begins a track; the object is lost where nothing explains it."""
-        registrar, config = self.registrar, self.config
-        seen, candidate, likelier = self._locate(frame)
+        registrar, config = self.registrar.narrowed(frame.scene), self.config
+        seen, candidate, likelier = self._locate(frame, registrar)
         must_register = registrar.method != "auto" or registrar.network is None
         if candidate.error is not None and must_register:
             raise candidate.error
         self._has_begun, alone = True, None
         if candidate.modes is not None:
-            alone = _Tracked.of_frame(candidate, frame.time_s, config, registrar.config)
+            alone = _Tracked.of_frame(candidate, frame.time_s, config, self.registrar)
         if alone is None or self._doubt(alone):
             registration = None if alone is None else alone.fitted.registration
             answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
@@ -476,13 +493,15 @@ class Tracker:
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
         calibration = None if model is None else model.calibration
-        recognition = recognize(tracked.fitted.registration, calibration, stated_scene_unit=stated)
+        recognition = recognize(
+            tracked.fitted.registration, calibration, stated_scene_unit=stated, has_weights=model is not None
+        )
         recognition = recognition.doubted(frame.seen.doubt)
         seen = in_registered_unit(frame.seen, self.registrar, tracked.fitted.registration, recognition)
         return Answer(
             seen=seen.read_as(tracked.hypothesis),
             model=model,
-            registrar=self.registrar,
+            registrar=self.registrar.in_scene(frame.scene),
             hypothesis=tracked.hypothesis,
             T_camera_input=self._T_camera_input,
             registration=tracked.fitted.registration,
@@ -499,7 +518,7 @@ class Tracker:
         if alone is None or alone.model is None:
             hypothesis = Reading.of_all(frame.seen.cloud)
             alone = Answer(frame.seen, None, self.registrar, hypothesis, self._T_camera_input, located_by="search")
-        recognition = Recognition(False, reason, MOST)
+        recognition = Recognition(False, reason, MOST, has_weights=alone.model is not None)
         return replace(alone, recognition=recognition, tracking="lost", seconds=time.perf_counter() - started)
 
 
@@ -512,11 +531,12 @@ class _Tracked:
     hypothesis: Reading
 
     @classmethod
-    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, constants: FitConfig) -> "_Tracked":
-        """Candidate of a frame that was fitted by itself."""
+    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, registrar: Registrar) -> "_Tracked":
+        """Candidate of a frame that was fitted by itself, maybe with known joints, which the track goes on without."""
         assert candidate.modes is not None
         fitted = replace(candidate.modes, rest=None)
-        return cls(fitted, Track.of(fitted, time_s, config, constants), candidate.hypothesis)
+        track = Track.of(fitted.in_model(registrar.model), time_s, config, registrar.config)
+        return cls(fitted, track, candidate.hypothesis)
 
     @property
     def score(self) -> float:

@@ -26,7 +26,7 @@ from mereo.io.intrinsics import camera_from_fields, warn_of_distortion
 from mereo.io.readers import metres, open_image
 
 IMAGE, CLOUD, INFO = "sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/CameraInfo"
-COMPRESSED = "sensor_msgs/msg/CompressedImage"
+COMPRESSED, JOINTS = "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/JointState"
 FRAMES = (IMAGE, COMPRESSED, CLOUD)
 """Types of messages that hold frames."""
 
@@ -51,11 +51,13 @@ class RecordedFrame:
         topic: where it was published.
         time_s: when it was recorded, in seconds.
         read: decodes it; raises ``ValueError`` where its content is broken or not a depth.
+        joints: reads the last ``JointState`` before it; None where there is none, or none is wanted.
     """
 
     topic: str
     time_s: float
     read: Callable[[], Content]
+    joints: Callable[[], Any] | None = None
 
     @property
     def name(self) -> str:
@@ -73,6 +75,7 @@ def recorded_frames(
     topic: str | None = None,
     camera: Camera | None = None,
     depth_scale: float | None = None,
+    joints: str | None = None,
 ) -> Iterator[RecordedFrame]:
     """Frames of one topic in the order of recording.
 
@@ -83,6 +86,7 @@ def recorded_frames(
             P. It is taken to hold for the whole recording.
         depth_scale: value of one metre in integer images; by default what a recording of the RealSense SDK states,
             else 1000.
+        joints: topic of joints' values, of which each frame has the last before it.
 
     Raises ``ImportError`` without the extra `sensors`, ``FileNotFoundError``, and ``ValueError`` where the bag cannot
     be read, has no such topic, or no CameraInfo.
@@ -104,11 +108,19 @@ def recorded_frames(
             image = depth_image if connections[0].msgtype == IMAGE else _compressed_depth
             scale = depth_scale or _realsense_scale(reader, topic)
             decode = partial(image, camera=camera or _camera(reader, topic, path), depth_scale=scale)
+        states = [c for c in reader.connections if c.topic == joints and c.msgtype == JOINTS]
+        if joints is not None and not states:
+            known = ", ".join(_topics(reader, JOINTS)) or "none"
+            raise ValueError(f"{path} has no joint states on topic {joints!r}; those it has are on: {known}")
         store, ros2 = reader.typestore, reader.is2  # a frame may be read when the bag is closed
-        for connection, stamp_ns, data in _messages(reader, connections, path):
+        state: Callable[[], Any] | None = None
+        for connection, stamp_ns, data in _messages(reader, [*connections, *states], path):
             message = partial(store.deserialize_cdr if ros2 else store.deserialize_ros1, data, connection.msgtype)
+            if connection.msgtype == JOINTS:
+                state = message
+                continue
             source = f"{path}, {topic} at {stamp_ns} ns"
-            yield RecordedFrame(topic, stamp_ns / 1e9, partial(_read, decode, message, source))
+            yield RecordedFrame(topic, stamp_ns / 1e9, partial(_read, decode, message, source), state)
 
 
 def recorded_frame(

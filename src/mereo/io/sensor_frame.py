@@ -244,9 +244,12 @@ def _is_in_view(points: Points) -> bool:
     return bool((points[:, 2] > IN_VIEW * norm(points, axis=1)).mean() >= MOST_IN_VIEW)
 
 
-def read_messages(path: Path, reading: InputConfig) -> Iterator[RecordedFrame]:
-    """Messages of a ROS recording's topic in their order, for ``message_frame``; raises as ``read_frame``."""
-    return recorded_frames(path, *_recording_options(reading))
+def read_messages(path: Path, reading: InputConfig, joints: str | None = None) -> Iterator[RecordedFrame]:
+    """Messages of a ROS recording's topic in their order, for ``message_frame``; raises as ``read_frame``.
+
+    ``joints`` is a topic of joints' values, as in ``recorded_frames``.
+    """
+    return recorded_frames(path, *_recording_options(reading), joints)
 
 
 def message_frame(message: RecordedFrame, path: Path, reading: InputConfig) -> SensorFrame:

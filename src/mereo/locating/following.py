@@ -16,6 +16,7 @@ from mereo.fitting.tracking import Track, TrackedFrame
 from mereo.locating.whole_frame import NEAR, at_point, is_whole, locate_object, part_of, pixels_near
 from mereo.reconstruction.observation import Observation
 from mereo.reconstruction.pipeline import EncodedFrame
+from mereo.scenes.scene import Scene
 
 
 def search_frame(
@@ -41,16 +42,22 @@ class Tracker(tracking.Tracker):
         super().__init__(registrar, config, executor, search_frame)
 
     def follow(
-        self, seen: Observation, time_s: float, *, scene_unit: float | None = None, keep_all: bool = False
+        self,
+        seen: Observation,
+        time_s: float,
+        *,
+        scene_unit: float | None = None,
+        keep_all: bool = False,
+        scene: Scene | None = None,
     ) -> Answer:
         """Answer the next frame, as ``tracking.Tracker``; a point is where the object is in the first one."""
         seen = replace(seen, point=None) if self._has_begun else at_point(seen, self.registrar)
-        return super().follow(seen, time_s, scene_unit=scene_unit, keep_all=keep_all)
+        return super().follow(seen, time_s, scene_unit=scene_unit, keep_all=keep_all, scene=scene)
 
-    def _locate(self, frame: TrackedFrame) -> tuple[Observation, Candidate, EncodedFrame]:
-        if not is_whole(frame.seen, self.registrar):
-            return super()._locate(frame)
-        seen, candidate = locate_object(frame.seen, self.registrar, frame.keep_all, frame.scene_unit)
+    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate, EncodedFrame]:
+        if not is_whole(frame.seen, registrar):
+            return super()._locate(frame, registrar)
+        seen, candidate = locate_object(frame.seen, registrar, frame.keep_all, frame.scene_unit)
         return seen, candidate, candidate.encoded
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:

@@ -76,6 +76,15 @@ def described(part: Any, is_present: bool) -> str:
     return f"{type(part).__name__}({part.name!r}, {figures})"
 
 
+def along_axes(surfaces: SegmentedMesh, before: LabelGrid) -> LabelGrid:
+    """Label grid of surfaces along the axes of their frame, as fine as that ``before``."""
+    spacing, (low, high) = before.spacing, surfaces.bounds
+    counts = np.ceil((high - low) / spacing).astype(int) + 3  # with one empty voxel around
+    corner = (low + high - (counts - 1) * spacing) / 2
+    grid = replace(before, labels=np.zeros(counts, np.uint8), origin=corner)
+    return replace(grid, labels=label_grid(surfaces, *grid.axes()))
+
+
 @dataclass(frozen=True, eq=False)
 class Reconstruction:
     """Object with all its segments, in the input's frame and units.
@@ -110,12 +119,8 @@ class Reconstruction:
 
     def transformed(self, T_new_input: Transform) -> "Reconstruction":
         """The same in another frame, by a rigid transform; its label grid lies along the new axes."""
-        surfaces, spacing = self.surfaces.transformed(T_new_input), self.labels.spacing
-        low, high = surfaces.bounds
-        counts = np.ceil((high - low) / spacing).astype(int) + 3  # with one empty voxel around
-        corner = (low + high - (counts - 1) * spacing) / 2
-        grid = replace(self.labels, labels=np.zeros(counts, np.uint8), origin=corner)
-        grid = replace(grid, labels=label_grid(surfaces, *grid.axes()))
+        surfaces = self.surfaces.transformed(T_new_input)
+        grid = along_axes(surfaces, self.labels)
         segments = tuple(
             replace(
                 segment,

@@ -101,6 +101,10 @@ class RegistrationState(Block):
     seconds: Annotated[FiniteFloat, Field(ge=0)]
     witness: Annotated[tuple[Point, ...], Field(min_length=WITNESSES, max_length=WITNESSES)]
 
+    def seen_from(self, T_camera_input: Transform) -> "RegistrationState":
+        """The same of an input in other coordinates."""
+        return self.model_copy(update={"T_camera_input": _rows(T_camera_input)})
+
     @model_validator(mode="after")
     def _fits(self) -> "RegistrationState":
         if self.format != FORMAT:
@@ -250,7 +254,8 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
     if model_digest(model) != state.model:
         raise ValueError(
             f"the state belongs to the statistical model of other weights (scene {state.scene!r}, weights "
-            f"{state.weights!r}); its numbers mean nothing here: give the model of those weights"
+            f"{state.weights!r}); its numbers mean nothing here: give the model of those weights, or without any the "
+            "object as it was looked for, with the joints that were known"
         )
     z, drawn = np.array(state.z, float), None
     if state.draws is None:

@@ -19,17 +19,22 @@ from zlib import crc32
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
+from numpy.linalg import norm
 from numpy.random import default_rng
 from scipy.special import ndtr, ndtri
 
-from mereo.deformation.maps import Deformations
+from mereo.deformation.maps import Deformations, moved_by
 from mereo.deformation.samplers import JointSampler, RandomMotion
 from mereo.geometry.conventions import Names, Pair, Range
 from mereo.io.bounds import NotNegative, Number, check_value
+from mereo.io.cores import limit_blas_threads
 from mereo.io.errors import AnyPath, value_text
 from mereo.io.yaml_document import Document
 from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Place, Recorder, Shares, Trail
+from mereo.scenes.random_states import OBJECT_STATES, STATES_SEED, build_model, sample_states
 from mereo.scenes.scene import Scene
+from mereo.scenes.seeds import example_rng
+from mereo.scenes.statistical_model import FLOOR, LEAST_RATIO, PairDistances, StatisticalModel
 
 MANY, MANY_NORMAL = 48, 3
 """An array of more numbers than the first, or of more normal ones than the second, gets one slider."""
@@ -374,6 +379,40 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
                 f"joint {name!r} is {value:.6g}, which contradicts others that move with it: give {leader!r} alone"
             )
     return replace(scene, sample_deformations=motion.narrowed(shares))
+
+
+def narrowed_model(scene: Scene, model: StatisticalModel) -> StatisticalModel:
+    """Statistical model of the states of a scene ``with_joints``, with the material points of ``model``, its object's.
+
+    It is made in seconds, at once where all values are known.
+    """
+    motion = scene.sample_deformations
+    assert isinstance(motion, RandomMotion)
+    joints = [joint for joint, _ in motion.joints.values()]
+    count = OBJECT_STATES if parameters(random_state(scene, STATES_SEED)) else 2
+    states = sample_states(scene, model.nodes, model.node_labels, count, STATES_SEED)
+    with limit_blas_threads():
+        made = build_model(model.rest, model.nodes, model.node_labels, states)
+    rests = all(joint.shares[0] <= joint.share(0.0) <= joint.shares[1] for joint in joints)
+    return replace(made, source_frame=model.source_frame, rests=rests)
+
+
+COMPARED, TRIED = 100, 24
+"""Material points between which known joints say distances, and states among which these must not vary."""
+
+
+def known_distances(scene: Scene, model: StatisticalModel) -> PairDistances:
+    """Distances of material points of ``model`` that all states of a scene ``with_joints`` keep, but its own do not."""
+    rows = model.sparse[:COMPARED]
+    points, owners = model.rest_points[rows], model.labels[rows] - 1
+    drawn = (scene.sample_deformations(example_rng(STATES_SEED, i)) for i in range(TRIED))
+    states = np.stack([moved_by(points, owners, deformations) for deformations in drawn])
+    others = model.sparse_library[:: max(1, len(model.sparse_library) // TRIED), :COMPARED]
+    first, second = np.triu_indices(len(rows), 1)
+    kept, usual = (norm(each[:, first] - each[:, second], axis=2) for each in (states, others))
+    std = np.maximum(kept.std(axis=0), FLOOR * model.half)
+    known = np.flatnonzero(usual.std(axis=0) > LEAST_RATIO * std)
+    return PairDistances(rows[first[known]], rows[second[known]], kept.mean(axis=0)[known], std[known])
 
 
 def _values(given: Any, names: list[str]) -> dict[str, Range]:

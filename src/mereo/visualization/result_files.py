@@ -19,7 +19,7 @@ from mereo.io.atomic_files import JsonObject
 from mereo.io.attachments import Surfaces, write_attachment
 from mereo.io.config import DEFAULT_FILES, FilesConfig
 from mereo.io.sensor_frame import SensorFrame
-from mereo.io.writers.formats import WRITERS, Results, chosen_formats, write_formats
+from mereo.io.writers.formats import Results, chosen_formats, write_formats, write_single
 from mereo.io.writers.glb import GLTF_CAMERA_ROTATION, write_segments_glb
 from mereo.results.carry import Carried
 from mereo.results.joints import measure_joints, pose_covariance, segment_poses
@@ -153,9 +153,7 @@ def write_answer_file(path: Path, suffix: str, answer: Answer, files: FilesConfi
     elif suffix == ".html":
         report_of(answer, coarsened(surfaces), summary_of(answer)).write(path)
     else:
-        (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
-        chosen_formats([name])
-        WRITERS[name].write(path, replace(_results(answer, files), summary=summary_of(answer)))
+        write_single(path, suffix, replace(_results(answer, files), summary=summary_of(answer)))
 
 
 def _results(answer: Answer, files: FilesConfig) -> Results:

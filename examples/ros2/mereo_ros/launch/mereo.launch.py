@@ -12,6 +12,7 @@ TOPICS = {
     "depth": ("/camera/camera/depth/image_rect_raw", "depth image, sensor_msgs/Image"),
     "camera_info": ("/camera/camera/depth/camera_info", "its intrinsics, sensor_msgs/CameraInfo"),
     "points": ("/camera/camera/depth/color/points", "cloud in an optical frame, sensor_msgs/PointCloud2"),
+    "joint_states": ("/joint_states", "known joints, sensor_msgs/JointState, where the parameter known_joints is true"),
 }
 
 

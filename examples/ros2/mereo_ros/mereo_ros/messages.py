@@ -38,6 +38,11 @@ def seconds(header: Any) -> float:
     return header.stamp.sec + 1e-9 * header.stamp.nanosec
 
 
+def nearest(states: list[Any], time_s: float) -> Any:
+    """Message whose time is nearest to that of a frame; None of none."""
+    return min(states, key=lambda state: abs(seconds(state.header) - time_s), default=None)
+
+
 def depth_frame(image: Any, info: Any, rectified: bool) -> mereo.DepthImage:
     """Depth image in metres with its camera; ``ValueError`` says in one sentence what is wrong with a message."""
     try:

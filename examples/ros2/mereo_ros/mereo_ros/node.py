@@ -1,6 +1,6 @@
 """Node that finds an object in the newest frame of a topic, again and again, and publishes where it is.
 
-    depth and camera_info, or points -> tf, ~/markers, ~/joint_states, ~/pose, /diagnostics
+    depth and camera_info, or points; joint_states -> tf, ~/markers, ~/joint_states, ~/pose, /diagnostics
 
 The executor's thread takes messages; a thread of the node answers the newest, and others are dropped. What a robot acts
 on is published for a known object alone: one that is lost or refused has no transform, and diagnostics say why.
@@ -9,6 +9,7 @@ on is published for a known object alone: one that is lost or refused has no tra
 import queue
 import threading
 import time
+from collections import deque
 from contextlib import suppress
 from typing import Any
 
@@ -37,12 +38,19 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "rectified": (True, "the depth image is rectified, so that its intrinsics are the matrix P, and not K"),
     "object_frame": ("object", "frame of the object's files, in metres; its segments are below it"),
     "publish_unsure": (False, "publish the pose of an object that is unsure, too"),
+    "known_joints": (
+        False,
+        "the topic joint_states has the object's joints, as of encoders: only the rest is looked for",
+    ),
     "silent_s": (2.0, "seconds without a frame after which diagnostics are stale"),
 }
 """Default and description of each parameter; they are read once, when the node starts."""
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """As of sensor data, which a driver may publish either way, but of one message: older ones would be dropped here."""
+
+STATES = 1000
+"""Values of joints that are kept: a frame takes those nearest to its own time."""
 
 
 class ObjectTracker(Node):
@@ -63,15 +71,14 @@ class ObjectTracker(Node):
                 f"the object is {named!r}; it must be the name of a file, or a list of such: correct the parameter"
             )
         files = [file for file in ([named] if isinstance(named, str) else named) if file]
-        self.tracker = mereo.Tracker(
-            mereo.load_object(
-                files[0] if len(files) == 1 else files or None,
-                weights=stated["weights"] or None,
-                units=stated["units"] or None,
-                deformations=stated["deformations"],
-            ),
-            stated["method"],
+        known = mereo.load_object(
+            files[0] if len(files) == 1 else files or None,
+            weights=stated["weights"] or None,
+            units=stated["units"] or None,
+            deformations=stated["deformations"],
         )
+        self.tracker, self.known_names = mereo.Tracker(known, stated["method"]), set(known.joints)
+        self.states: deque[JointState] = deque(maxlen=STATES)
         self.stated, self.object_frame = stated, stated["object_frame"]
         self.info: Any = None
         self.dropped, self.last_s, self.arrived_s = 0, float("-inf"), time.monotonic()
@@ -83,6 +90,8 @@ class ObjectTracker(Node):
         self.diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 1)
         self.thread = threading.Thread(target=self._answer_newest, daemon=True, name="answers")
         self.thread.start()
+        if stated["known_joints"]:
+            self.create_subscription(JointState, "joint_states", self._keep_joints, STATES)
         if stated["input"] == "depth":
             self.create_subscription(CameraInfo, "camera_info", self._keep_info, NEWEST)
             self.create_subscription(Image, "depth", self._receive, NEWEST)
@@ -99,6 +108,10 @@ class ObjectTracker(Node):
 
     def _keep_info(self, info: CameraInfo) -> None:
         self.info = info
+
+    def _keep_joints(self, state: JointState) -> None:
+        if self.known_names.intersection(state.name):  # others publish there, too
+            self.states.append(state)
 
     def _receive(self, message: Any) -> None:
         self.arrived_s = time.monotonic()
@@ -145,7 +158,8 @@ class ObjectTracker(Node):
         if time_s < self.last_s:  # a recording that starts again
             self.tracker.forget()
         self.last_s = time_s
-        result = self.tracker.follow(frame, time_s, unit_m=1.0, **reading)
+        joints = messages.nearest(list(self.states), time_s)
+        result = self.tracker.follow(frame, time_s, unit_m=1.0, joints=joints, **reading)
         level, words, facts = messages.judge(result)
         facts |= {"work_s": round(time.perf_counter() - begun, 4), "dropped": self.dropped}
         self._publish_status(header, level, words, facts)

@@ -41,7 +41,7 @@ from mereo.fitting.problem.residuals import (
     silhouette_losses,
 )
 from mereo.fitting.problem.segments import Joints
-from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
+from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, PairDistances, StatisticalModel
 
 COARSE = 3
 """How many times fewer observed samples a choice among many states needs."""
@@ -138,6 +138,12 @@ class Problem:
         """A problem of the same model, with what this one has prepared of the model's surface."""
         other = replace(self, **changes)
         vars(other).update({name: vars(self)[name] for name in ("pairs", "samples", "joints") if name in vars(self)})
+        return other
+
+    def with_distances(self, *known: PairDistances) -> "Problem":
+        """The problem of a frame of which these distances are known, in the place of earlier ones."""
+        other = self.changed()
+        vars(other)["pairs"] = PairTerm.of(self.model, *known)
         return other
 
     # what depends on the noise

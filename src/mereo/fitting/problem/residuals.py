@@ -20,7 +20,7 @@ from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Row
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import unit_rows
-from mereo.scenes.statistical_model import StatisticalModel
+from mereo.scenes.statistical_model import PairDistances, StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
 
@@ -338,6 +338,10 @@ def are_near(model: StatisticalModel) -> bool:
     return gain > 0
 
 
+PAIRS = "first", "second", "mean"
+"""What of ``PairDistances`` is put together as it is."""
+
+
 @dataclass(frozen=True, eq=False)
 class PairTerm:
     """Distances that the states keep: mean and modes of vectors between points, mean and deviation of their lengths."""
@@ -348,10 +352,12 @@ class PairTerm:
     std: Float[np.ndarray, " q"]
 
     @classmethod
-    def of(cls, model: StatisticalModel) -> "PairTerm":
-        """Term of the distances that a model's states keep."""
-        a, b = model.pairs.first, model.pairs.second
-        return cls(model.mean[a] - model.mean[b], model.modes[a] - model.modes[b], model.pairs.mean, model.pairs.std)
+    def of(cls, model: StatisticalModel, *known: PairDistances) -> "PairTerm":
+        """Term of the distances that a model's states keep, and of others that are ``known``, worth as much again."""
+        groups = [model.pairs, *known]
+        a, b, distance = (np.concatenate([getattr(each, name) for each in groups]) for name in PAIRS)
+        std = [each.std * np.sqrt(len(each) / max(1, len(a))) for each in groups]  # a mean over all is of each group's
+        return cls(model.mean[a] - model.mean[b], model.modes[a] - model.modes[b], distance, np.concatenate(std))
 
     def _vectors(self, z: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
         vector = self.mean + self.modes @ z.astype(np.float32)

@@ -100,7 +100,7 @@ def answer_of(
     calibration = None if model is None else model.calibration
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
     doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or None
-    recognition = recognize(registration, calibration, stated, refusal, unseen).doubted(doubt)
+    recognition = recognize(registration, calibration, stated, refusal, unseen, model is not None).doubted(doubt)
     taken = registrar is not None and registration is not None and registrar.takes(registration)
     used = candidate.encoded if taken else likelier
     if taken and registrar is not None and registration is not None:

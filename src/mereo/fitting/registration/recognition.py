@@ -9,7 +9,7 @@ the usual, in standard deviations and together, is the frame's strangeness; the 
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -140,6 +140,7 @@ class Recognition:
         strangeness: of all signs together, in standard deviations of what is usual.
         signs: what it was made of; None where no registration was found.
         calibrated: whether what is usual was measured with the weights.
+        has_weights: whether the object has any, which have learned its states; else its files say them.
     """
 
     known: Known
@@ -147,15 +148,15 @@ class Recognition:
     strangeness: float
     signs: Signs | None = None
     calibrated: bool = False
+    has_weights: bool = True
 
     @property
     def description(self) -> str | None:
         """Sentence for people; None where the object is known."""
         if self.reason is None:
             return None
-        return (
-            f"{'doubtful' if self.known == 'unsure' else 'not the object in a state that was learned'}: {self.reason}"
-        )
+        refused = f"not the object in a state {WORDS[self.has_weights].state}"
+        return f"{'doubtful' if self.known == 'unsure' else refused}: {self.reason}"
 
     def doubted(self, reason: str | None) -> "Recognition":
         """The same, unsure for a reason that outweighs its own; itself without one, and where the object is refused."""
@@ -182,6 +183,7 @@ def recognize(
     stated_scene_unit: float | None = None,
     refusal: str | None = None,
     unseen: float | None = None,
+    has_weights: bool = True,
 ) -> Recognition:
     """Whether a frame shows the object, in a state that was learned; never true of a fit that is not accepted.
 
@@ -191,9 +193,10 @@ def recognize(
         stated_scene_unit: length of a scene unit in the frame's unit, where the input states that.
         refusal: why no registration was found; None where none was wanted, and then recognition is not possible.
         unseen: as in ``Signs``.
+        has_weights: as in ``Recognition``.
     """
     if registration is None:
-        return NOT_EVALUATED if refusal is None else Recognition(False, refusal, MOST)
+        return NOT_EVALUATED if refusal is None else Recognition(False, refusal, MOST, has_weights=has_weights)
     calibrated = None if calibration is None else calibration.recognizing
     usual = calibrated or (OF_SOLIDS if registration.model.is_normal else CONSERVATIVE)
     signs = Signs.of(registration, stated_scene_unit, unseen)
@@ -201,10 +204,11 @@ def recognize(
     total = strangeness(each)
     is_usual = total <= UNSURE
     if is_usual and registration.accepted:
-        return Recognition(True, None, total, signs, calibrated is not None)
+        return Recognition(True, None, total, signs, calibrated is not None, has_weights)
     sign = "unexplained" if is_usual else max(each, key=lambda name: each[name])
-    reason = _reason(sign, registration, signs)
-    return Recognition(False if total >= REFUSED else "unsure", reason, total, signs, calibrated is not None)
+    reason = _reason(sign, registration, signs, WORDS[has_weights])
+    known: Known = False if total >= REFUSED else "unsure"
+    return Recognition(known, reason, total, signs, calibrated is not None, has_weights)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
@@ -216,21 +220,49 @@ FEATURELESS = (
 """Reason of ``Candidate.is_featureless``."""
 
 LOOK = "look at the result before you rely on it"
-WIDEN = f"{LOOK}, or name the weights of what it is; if it is this object, widen the scene's ranges and learn it again"
 
 
-def _reason(sign: str, registration: Registration, signs: Signs) -> str:
+class Words(NamedTuple):
+    """Words about an object: whose it is, the options of its units, how its states are known, how to have more."""
+
+    source: str
+    units: str
+    state: str
+    states: str
+    widen: str
+
+
+WORDS = {
+    True: Words(
+        source="weights",
+        units="--unit-m, --depth-scale",
+        state="that was learned",
+        states="that were learned",
+        widen="the scene's ranges and learn it again",
+    ),
+    False: Words(
+        source="files",
+        units="--unit-m, --depth-scale, of its files --units",
+        state="that its files allow",
+        states="that its files allow",
+        widen="its ranges in a scene file (mereo scene new)",
+    ),
+}
+"""Of an object with weights, and of one without."""
+
+
+def _reason(sign: str, registration: Registration, signs: Signs, words: Words) -> str:
     """Sentence about the sign that is strangest, with what to do."""
     if sign == "size":
         return (
             f"its size differs by a factor of {np.exp(signs.size or 0.0):.3g} from the object's in the frame's unit: "
-            "correct the unit (--unit-m, --depth-scale), or name the object's own weights"
+            f"correct the unit ({words.units}), or name the object's own {words.source}"
         )
     if sign == "unexplained" and registration.explained < 0.5:
         return (
             f"only {registration.explained:.0%} of the points can be the model's: this is probably another object, "
             "not the object alone, or no camera frame: leave out what is not the object, turn the cloud (--frame), or "
-            "name the object's own weights"
+            f"name the object's own {words.source}"
         )
     if sign == "unexplained":
         return (
@@ -248,9 +280,10 @@ def _reason(sign: str, registration: Registration, signs: Signs) -> str:
             "what hides it: give the whole depth image, state that a part is seen (--extent partial), or take a frame "
             "of the whole object"
         )
+    widen = f"{LOOK}, or name the {words.source} of what it is; if it is this object, widen {words.widen}"
     if sign == "beyond" or (sign == "unusual" and registration.beyond_states > 0.5):
         return (
-            f"the state lies {registration.beyond_states:.1f} scene units outside those that were learned, and rigid "
-            f"parts may be bent: {WIDEN}"
+            f"the state lies {registration.beyond_states:.1f} scene units outside those {words.states}, and rigid "
+            f"parts may be bent: {widen}"
         )
-    return f"the object would be bent farther than in the states that were learned: {WIDEN}"
+    return f"the object would be bent farther than in the states {words.states}: {widen}"

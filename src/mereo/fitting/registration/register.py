@@ -40,6 +40,7 @@ from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.calibration import Calibration, RadiusFactors
 from mereo.models.trained import EncodedCloud, Trained
+from mereo.scenes.parameters import narrowed_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
 from mereo.scenes.statistical_model import StatisticalModel
@@ -103,6 +104,15 @@ class ModesFit:
     rest: ScoredFit | None = None
     calibration: Calibration | None = None
     others: tuple[Float[np.ndarray, "m 3"], ...] = ()
+
+    def in_model(self, model: StatisticalModel) -> "ModesFit":
+        """The same state by another model of the same material points."""
+        before, posed = self.problem.model, self.posed
+        if model is before:
+            return self
+        T, z = model.project(before.material(posed.z))
+        posed = Posed(posed.rotation @ T[:3, :3], posed.place(T[:3, 3:].T)[0], z, posed.log_scale)
+        return replace(self, problem=replace(self.problem, model=model), posed=posed)
 
     @property
     def may_take_draws(self) -> bool:
@@ -320,6 +330,14 @@ class Registrar:
         moved = copy(self)
         object.__setattr__(moved, "network", network)  # `replace` would forget what is cached
         return moved
+
+    def in_scene(self, scene: Scene | None) -> "Registrar":
+        """The same where the joints lie as in this scene; None where nothing is known of them."""
+        return self if scene is None else replace(self, given=scene)
+
+    def narrowed(self, scene: Scene | None) -> "Registrar":
+        """The same with the statistical model of that scene's states alone, which is made in seconds."""
+        return self if scene is None else replace(self, given=scene, model=narrowed_model(scene, self.model))
 
     def stated_scene_unit(self, unit_m: float | None) -> float | None:
         """Length of a scene unit in a frame's unit of ``unit_m`` metres; None where that or the object's is unknown."""

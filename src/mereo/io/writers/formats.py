@@ -134,6 +134,13 @@ def chosen_formats(names: Iterable[str]) -> tuple[Format, ...]:
     return chosen
 
 
+def write_single(path: Path, suffix: str, results: Results) -> None:
+    """Write the one format whose file has this suffix, as ".glb"; raises as ``chosen_formats``."""
+    (name,) = (name for name, writer in WRITERS.items() if writer.file.endswith(suffix) and name != "points")
+    chosen_formats([name])
+    WRITERS[name].write(path, results)
+
+
 def write_formats(directory: Path, formats: Iterable[Format], results: Results) -> None:
     """Write each of the formats into an existing directory."""
     for name in formats:

@@ -23,7 +23,7 @@ from mereo.geometry.conventions import Range
 from mereo.geometry.mesh import Segment, SegmentedMesh, palette_color
 from mereo.geometry.mesh_check import examine, united
 from mereo.geometry.subdivision import TooManyFaces, split_edges
-from mereo.geometry.transforms import NamedPoses, Normalizer, longest_side
+from mereo.geometry.transforms import NamedPoses, Normalizer, checked_pose, longest_side
 from mereo.io.config import RobotMeshes, Space
 from mereo.io.mesh_formats import MeshWarning
 from mereo.io.robots import is_robot, read_object_file, read_robot
@@ -150,7 +150,7 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
         T_scene_source=placement.matrix,
         definition=definition,
         space=_space(document, file),
-        link_frames=_link_frames(document, file),
+        link_frames=link_frames(document, file),
     )
 
 
@@ -166,11 +166,11 @@ def _space(document: Document, file: SceneFile) -> Space | None:
     return next(iter(spaces), None)
 
 
-def _link_frames(document: Document, file: SceneFile) -> NamedPoses:
-    """Frames of the links of a robot's file, by the segments: that of the first link of each; else none."""
+def link_frames(document: Document, file: SceneFile) -> NamedPoses:
+    """Frames of segments: as they state them, or of a robot's file, of the first link of each; else none."""
     path = document.path.parent / (file.model or "")
     if file.model is None or not is_robot(path):
-        return NamedPoses()
+        return {part.name: checked_pose(part.frame) for part in file.segments or () if part.frame is not None}
     frames = read_robot(path, file.robot_meshes).link_frames
     if file.parts is None:
         return frames

@@ -31,7 +31,7 @@ from mereo.geometry.symmetry import TOLERANCE, describe_symmetries, find_symmetr
 from mereo.geometry.transforms import inverse_rigid, longest_side
 from mereo.io.atomic_files import JsonObject, check_file_place, remove_abandoned, write_file
 from mereo.io.yaml_document import Document
-from mereo.scenes.files.build import build, read, read_segments
+from mereo.scenes.files.build import build, link_frames, read, read_segments
 from mereo.scenes.files.deformation_blocks import is_robot_joint
 from mereo.scenes.files.template import flat_base, measure_motion
 from mereo.scenes.registry import is_yaml, load_scene
@@ -208,7 +208,7 @@ def _holds(place: Path, content: bytes) -> bool:
     return place.is_file() and not place.is_symlink() and place.read_bytes() == content
 
 
-KINDS = ("segments", "model", "parts", "labels", "names", "cells")
+KINDS = ("segments", "model", "parts", "robot_meshes", "labels", "names", "cells")
 """Keys that say where the segments come from."""
 
 HEADER = """\
@@ -224,6 +224,7 @@ def _with_segment_files(document: Document, mesh: SegmentedMesh, changed: set[st
     its segments from one kind of source.
     """
     kept, outer = "segments" in document.data, dict(mesh.nested)
+    frames = link_frames(document, read(document))
     files = {name: re.sub(r"[^\w.-]+", "_", name) + "-repaired.ply" for name in (changed if kept else mesh.names)}
     if kept:
         segments = [{**block, "file": files.get(block["name"], block["file"])} for block in document.data["segments"]]
@@ -231,6 +232,7 @@ def _with_segment_files(document: Document, mesh: SegmentedMesh, changed: set[st
         segments = [
             {"name": segment.name, "file": files[segment.name], "color": list(segment.color)}
             | ({"nested_in": outer[segment.name]} if segment.name in outer else {})
+            | ({"frame": frames[segment.name].tolist()} if segment.name in frames else {})
             for segment in mesh.segments
         ]
     first = next(key for key in document.data if key in KINDS)

@@ -35,7 +35,7 @@ from mereo.geometry.conventions import UNITS_M, Texts, Triple
 from mereo.geometry.conventions import Range as Limits
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Corners, Indices, Normalizer, Points, Values, Vector, longest_side
+from mereo.geometry.transforms import Corners, Indices, Normalizer, Points, Values, Vector, checked_pose, longest_side
 from mereo.io.config import RobotMeshes
 from mereo.io.point_arrays import model_points
 from mereo.io.readers import read_points
@@ -58,6 +58,14 @@ def _ascending(value: Limits) -> Limits:
 def _pointing(value: Triple) -> Triple:
     if not any(value):
         raise ValueError("it is a direction and must have a length")
+    return value
+
+
+def _placing(value: list[list[float]]) -> list[list[float]]:
+    try:
+        checked_pose(value)
+    except ValueError:
+        raise ValueError("it must be 4 x 4 numbers, a rotation and a translation above 0 0 0 1") from None
     return value
 
 
@@ -606,9 +614,16 @@ class PartLook(Block):
 
 
 class FilePart(PartLook):
-    """Segment from a mesh file of its own."""
+    """Segment from a mesh file of its own.
+
+    Attributes:
+        file: of the mesh.
+        frame: pose at rest of the frame that results have the pose of, as a robot's link has one; that of the files
+            where absent.
+    """
 
     file: FileName
+    frame: Annotated[list[list[Number]], AfterValidator(_placing)] | None = None
 
 
 class ModelPart(PartLook):
