@@ -20,9 +20,8 @@ from mereo.fitting.problem.evidence import UNDECIDED, Evidence
 from mereo.fitting.problem.gauss_newton import POSE, Posed, along
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Prior, are_near
-from mereo.fitting.registration.answer_frame import search_modes
 from mereo.fitting.registration.recognition import recognize
-from mereo.fitting.registration.register import CloudToFit, ModesFit, is_drawn
+from mereo.fitting.registration.register import ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import rotations
 from mereo.fitting.tracking import PAUSE_S, Track, explore
@@ -63,7 +62,8 @@ def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, r
     assert registration.ruled_out == 0.0 and recognize(registration).known is True
     points = view.depth.to_points().points
     left = points[points[:, 0] < np.median(points[:, 0])]
-    half = search_modes(CloudToFit(left, 1.0, lines=replace(UNDECIDED, other_lines="past")), model).registration
+    past = replace(UNDECIDED, other_lines="past")
+    half = fit_modes(left, model, 1.0, true_material(model, view), past).registration
     assert half.ruled_out is not None and half.ruled_out > 0.1
     said = recognize(half)
     assert said.known is not True and said.reason is not None

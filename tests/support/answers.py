@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
+from mereo.fitting.problem.evidence import UNDECIDED
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame, search_modes
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.geometry.camera import PointCloud
+from mereo.geometry.camera import PointCloud, SightLines
 from mereo.geometry.conventions import CloudAxes
 from mereo.models.model import Model
 from mereo.reconstruction.observation import observe
@@ -45,11 +46,13 @@ def reconstruct(
     return answer_to(points, model, None, resolution, axes, **options).reconstruction
 
 
-def fit_modes(points: ndarray, model: StatisticalModel, unit: float, material: ndarray) -> ModesFit:
+def fit_modes(
+    points: ndarray, model: StatisticalModel, unit: float, material: ndarray, lines: SightLines = UNDECIDED
+) -> ModesFit:
     """Fit of the modes from the mean state where a state's material points, in scene units, are."""
     T, _ = model.project(material)
     start = Posed(T[:3, :3], T[:3, 3], np.zeros(model.count))
-    return search_modes(CloudToFit(points, unit), model, starts=[start], rounds=())
+    return search_modes(CloudToFit(points, unit, lines=lines), model, starts=[start], rounds=())
 
 
 def fit_cloud(points: ndarray, model: StatisticalModel, material: ndarray, unit: float = 1.0) -> Registration:
