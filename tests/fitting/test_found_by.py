@@ -26,7 +26,7 @@ from mereo.fitting.problem.problem import (
 )
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.answer import Candidate
-from mereo.fitting.registration.answer_frame import search_hypotheses
+from mereo.fitting.registration.answer_frame import in_registered_unit, search_hypotheses
 from mereo.fitting.registration.register import ModesFit, Registrar
 from mereo.fitting.search import screen_poses
 from mereo.fitting.uncertainty import ModesOptimum
@@ -70,6 +70,14 @@ def test_a_network_that_is_lost_does_no_harm(
     found = answer_to(cloud, liver, Registrar.of(liver), 24, scene_unit=unit)
     assert found.recognition.known is True
     assert np.median(norm(found.registration.material - right.registration.material, axis=1)) < 1.0
+
+
+def test_the_size_of_another_object_says_nothing_of_the_unit(liver: Model, cloud: PointCloud) -> None:
+    registrar, seen = Registrar.of(liver), observe(cloud)
+    found = answer_to(cloud, liver, registrar, 24)
+    assert found.seen.frame.unit_m == registrar.unit_of(found.registration)
+    other = replace(found.recognition, known=False)
+    assert in_registered_unit(seen, registrar, found.registration, other).frame.unit_m is None
 
 
 def test_what_a_network_says_is_evidence(liver: Model, cloud: PointCloud) -> None:

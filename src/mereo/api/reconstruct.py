@@ -317,13 +317,13 @@ class Tracker:
     Each frame is fitted from the last one's state, in milliseconds, also where a hand or a tool hides a part of the
     object. ``Result.tracking`` says how it went:
 
-    - "found": the frame was fitted by itself, as the first one is: by a network, or, without weights, by a search, for
-      which it waits some seconds; or it was found again by a search in the background.
+    - "found": the frame was fitted by itself, as the first one is, for which it waits a second or some; or it was found
+      again by a search in the background.
     - "followed": the last frame's state led to it.
     - "lost": the object has left the view, is covered, or has moved too far; ``known`` is False and
-      ``recognition.reason`` says why. No registration is the answer: ``surfaces`` are a network's, which answered at
-      once but does not explain the frame; without weights they raise ``ValueError``. A search goes on in a thread of
-      its own, while frames are answered in milliseconds, until the object is found.
+      ``recognition.reason`` says why. No registration is the answer: ``surfaces`` raise ``ValueError``, but those of
+      the first frame are a network's, where there are weights. A search goes on in a thread of its own, while frames
+      are answered in milliseconds, until the object is found.
 
     ``close``, or leaving a ``with`` block, ends that thread.
     """

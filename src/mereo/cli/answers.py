@@ -146,7 +146,7 @@ class StreamCommand(FrameOptions):
 
     Each answer is one line of JSON on standard output, in the input's frame and units; rate and latency come at the
     end, on standard error. Where the object's own deformation model is known, it is followed: each frame's fit starts
-    from the last one's state, and network or search answer at first and where the object is lost. The exit status is
+    from the last one's state, and a search answers at first and where the object is lost. The exit status is
     0 where any frame was answered and the sequence was whole, else 2.
 
     Attributes:
