@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
 
-from mereo.api.objects import Object, load_object, load_weights
+from mereo.api.objects import Object, load_object, load_weights, object_of
 from mereo.api.reconstruct import reconstruct_observation
 from mereo.api.result import Result
 from mereo.api.words import option_words
@@ -137,8 +137,9 @@ class Answerer:
                 )
             seen = find_object(read, frame.isolation)
             read_s = time.perf_counter() - started
+            known = object_of(loaded.object, frame.joints)
             result = reconstruct_observation(
-                seen, loaded.object, loaded.method, resolution=frame.resolution, isolation=frame.isolation
+                seen, known, loaded.method, resolution=frame.resolution, isolation=frame.isolation
             )
         started = time.perf_counter()
         body = json_of(result, messages) if frame.media == JSON else glb_of(result, frame)

@@ -128,7 +128,7 @@ class Service:
             )
             intrinsics = _written(options.intrinsics, taken.intrinsics, folder)
             reading = options.reading(folder, intrinsics, taken.mask)
-            frame = FrameRequest(weights, folder, taken.frame, reading, isolation, resolution, media)
+            frame = FrameRequest(weights, folder, taken.frame, reading, isolation, resolution, media, options.joints)
             waiting = self.dispatcher.submit(frame, place)
         except BaseException:
             place.leave()

@@ -71,6 +71,7 @@ class FrameRequest:
         isolation: what of it is left out.
         resolution: cells along the longest side.
         media: of the answer.
+        joints: values that are known, by name.
     """
 
     weights: str
@@ -80,6 +81,7 @@ class FrameRequest:
     isolation: IsolationConfig
     resolution: int
     media: Media
+    joints: Mapping[str, Any] | None = None
 
     @property
     def path(self) -> Path:

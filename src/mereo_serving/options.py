@@ -1,10 +1,11 @@
 """Parameters of a request: the options of ``mereo reconstruct`` by the same names, checked before anything is read."""
 
+import re
 from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Json
 from pydantic_core import ErrorDetails
 
 from mereo.geometry.conventions import CloudAxes
@@ -15,39 +16,50 @@ from mereo_serving.messages import Refused
 Config = TypeVar("Config", InputConfig, IsolationConfig)
 
 
-def _numbers(given: Any) -> Any:
-    """Numbers of ``0.4,0.9`` or ``0.4 0.9`` as of the parameter that is given twice."""
-    parts = given if isinstance(given, list) else [given]
-    return [word for part in parts for word in (part.replace(",", " ").split() if isinstance(part, str) else [part])]
+def _numbers(count: int) -> BeforeValidator:
+    """So many numbers of ``0.4,0.9`` or ``0.4 0.9``, or of the parameter that is given again for each."""
+
+    def split(given: Any) -> list[str]:
+        words = " ".join(given if isinstance(given, list) else [given]).replace(",", " ").split()
+        if len(words) != count:
+            raise ValueError(f"{count} numbers")
+        return words
+
+    return BeforeValidator(split)
 
 
-Numbers = Annotated[list[float], BeforeValidator(_numbers)]
+Numbers = tuple[float, ...] | None
 
 
 class FrameOptions(BaseModel):
     """Parameters of a frame, in the query of its address."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, alias_generator=lambda name: name.replace("_", "-"))
 
     format: str | None = Field(None, description="Suffix of the frame's format, where its Content-Type does not say it")
     intrinsics: str | None = Field(None, description="The depth camera as JSON; or send it as a part of that name")
-    depth_scale: float | None = Field(None, alias="depth-scale", description="Pixel value of one metre")
-    depth_along: DepthAlong = Field("z", alias="depth-along", description="What a depth image measures: z, ray")
-    mask_value: list[int] = Field([], alias="mask-value", description="The object's values in a mask of ids")
+    depth_scale: float | None = Field(None, description="Pixel value of one metre")
+    depth_along: DepthAlong = Field("z", description="What a depth image measures: z, ray")
+    mask_value: list[int] = Field([], description="The object's values in a mask of ids")
     viewpoint: Viewpoint = Field("auto", description="Use of a PCD file's pose: auto, pose, ignored")
     frame: CloudAxes = Field("camera", description="Axes of a point cloud")
-    drop_invalid: bool = Field(False, alias="drop-invalid", description="Leave out points without a measurement")
-    unit_m: float | None = Field(None, alias="unit-m", description="Metres per unit of a point cloud")
-    frame_index: int | None = Field(None, alias="frame-index", description="Frame of intrinsics that describe many")
-    depth_range: Numbers | None = Field(None, alias="depth-range", description="Nearest and farthest depth kept, m")
-    box: Numbers | None = Field(None, description="Corners of what is kept: x0,y0,z0,x1,y1,z1 in metres")
-    remove_plane: bool = Field(False, alias="remove-plane", description="Leave out the largest plane")
-    remove_outliers: bool = Field(False, alias="remove-outliers", description="Leave out lone points")
-    largest_cluster: bool = Field(False, alias="largest-cluster", description="Keep the largest group of points")
-    cluster_gap: float = Field(0.0, alias="cluster-gap", description="Gap across which groups belong to it, metres")
-    keep_all: bool = Field(False, alias="keep-all", description="Drop no strays")
-    point: Numbers | None = Field(None, description="Column and row of a pixel of the object, in a depth image: u,v")
+    drop_invalid: bool = Field(False, description="Leave out points without a measurement")
+    unit_m: float | None = Field(None, description="Metres per unit of a point cloud")
+    frame_index: int | None = Field(None, description="Frame of intrinsics that describe many")
+    depth_range: Annotated[Numbers, _numbers(2)] = Field(None, description="Nearest and farthest depth kept, m")
+    box: Annotated[Numbers, _numbers(6)] = Field(
+        None, description="Corners of what is kept: x0,y0,z0,x1,y1,z1 in metres"
+    )
+    remove_plane: bool = Field(False, description="Leave out the largest plane")
+    remove_outliers: bool = Field(False, description="Leave out lone points")
+    largest_cluster: bool = Field(False, description="Keep the largest group of points")
+    cluster_gap: float = Field(0.0, description="Gap across which groups belong to it, metres")
+    keep_all: bool = Field(False, description="Drop no strays")
+    point: Annotated[Numbers, _numbers(2)] = Field(
+        None, description="Column and row of a pixel of the object, in a depth image: u,v"
+    )
     extent: Extent = Field("auto", description="How much of the object the frame shows: whole, partial, surface, auto")
+    joints: Json[dict[str, Any]] | None = Field(None, description='Known values of joints as JSON: {"hinge": 1.51}')
     resolution: int | None = Field(None, description="Cells along the longest side; by default the server's")
 
     def reading(self, folder: Path, intrinsics: str | None, mask: str | None) -> InputConfig:
@@ -58,11 +70,7 @@ class FrameOptions(BaseModel):
 
     def isolation(self) -> IsolationConfig:
         """What of the frame is left out; raises ``Refused`` (422)."""
-        counted = {
-            name: _of(getattr(self, name), count, name)
-            for name, count in (("depth_range", 2), ("box", 6), ("point", 2))
-        }
-        return self._config(IsolationConfig, counted)
+        return self._config(IsolationConfig, {})
 
     def _config(self, kind: type[Config], changed: dict[str, Any]) -> Config:
         """Settings whose fields are parameters of the same names, but for those that are changed."""
@@ -84,19 +92,6 @@ class FrameOptions(BaseModel):
         return self.resolution
 
 
-def _of(numbers: list[float] | None, count: int, name: str) -> Any:
-    if numbers is None:
-        return None
-    if len(numbers) != count:
-        name = name.replace("_", "-")
-        example = f"{name}={EXAMPLES[name]}"
-        raise Refused(422, f"{name} has {len(numbers)} numbers; it needs {count}: give for example {example}")
-    return tuple(numbers)
-
-
-EXAMPLES = {"depth-range": "0.4,0.9", "box": "-0.2,-0.2,0.4,0.2,0.2,0.9", "point": "320,240"}
-
-
 def sentence_of(error: ErrorDetails | dict[str, Any]) -> str:
     """Sentence about a parameter that pydantic refuses."""
     name = str(error["loc"][-1] if error["loc"][-1] != "query" else "query")
@@ -105,7 +100,7 @@ def sentence_of(error: ErrorDetails | dict[str, Any]) -> str:
         return f"there is no parameter {_brief(name)}; the parameters are {known}: correct the spelling"
     # what a list is of is named before the number in it
     names = [str(part) for part in error["loc"] if part != "query" and not isinstance(part, int)]
-    rule = str(error["msg"]).removeprefix("Input should be ").partition(",")[0]
+    rule = re.split("[,:]", re.sub("^(Input should be|Invalid|Value error,) ", "", error["msg"]))[0]
     return f"{names[0] if names else name} is {_brief(error.get('input'))}; it must be {rule}: correct it"
 
 

@@ -35,7 +35,7 @@ from mereo.io.robots import is_robot, read_robot
 from mereo.io.writers.meshes import write_positions_ply
 from mereo.results.joints import JointValue
 from mereo.scenes.files.object_files import scene_of_meshes
-from mereo.scenes.parameters import parameters, random_state
+from mereo.scenes.parameters import parameters, random_state, with_joints
 from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, SourceFrame
@@ -509,6 +509,23 @@ def test_known_values_narrow_the_random_states_whoever_states_them(known: mereo.
     assert fixed.model is not None and not are_near(fixed.model)
 
 
+def test_a_value_that_is_given_twice_is_one_value(known: mereo.Object, tmp_path: Path) -> None:
+    within = known.with_joints({"finger": {"value": 0.02, "within": 0.004}})
+    assert given_shares(within, {"finger": 0.022}) == pytest.approx((0.019 / 0.032,) * 2)
+    assert given_shares(within, {"finger": {"value": 0.03, "within": 0.01}}) == pytest.approx(
+        (0.017 / 0.032, 0.021 / 0.032)
+    )
+    fixed = known.with_joints({"finger": 0.02})
+    (true,) = write_frame(tmp_path / "frame.ply", known.scene, [0.017 / 0.032], 5)
+    sentence = "joint '%s' is %s, which contradicts what was given before, with the object: leave one of both out"
+    with mereo.Tracker(fixed) as tracker:
+        for time_s, joints in enumerate(({"finger": true}, {"other finger": 0.012})):
+            assert tracker.follow(tmp_path / "frame.ply", time_s, unit_m=1.0, joints=joints).known is True
+        for name, value in (("finger", 0.021), ("other finger", 0.011)):
+            with pytest.raises(ValueError, match=sentence % (name, value)):
+                tracker.follow(tmp_path / "frame.ply", 9.0, unit_m=1.0, joints={name: value})
+
+
 def test_an_angle_beyond_limits_is_named_as_it_was_given_and_links_are_rigid(tmp_path: Path) -> None:
     (tmp_path / "laptop.urdf").write_text(LAPTOP)
     laptop = mereo.load_object(tmp_path / "laptop.urdf", deformations="rigid")  # with a joint all the same
@@ -525,6 +542,10 @@ def test_a_joint_of_a_whole_turn_goes_on_beyond_its_limits(tmp_path: Path) -> No
         assert scene is not None and isinstance(scene.sample_deformations, RandomMotion)
         shares = np.array(scene.sample_deformations.joints["hinge"][0].shares)
         assert_allclose((2 * pi * shares - pi) % (2 * pi), [3.0, 3.2], atol=1e-9)
+        turned = with_joints(scene, {"hinge": -3.13}).sample_deformations  # the same angle on the other side of a turn
+        assert_allclose((2 * pi * np.array(turned.joints["hinge"][0].shares) - pi) % (2 * pi), 2 * pi - 3.13)
+        with pytest.raises(ValueError, match="joint 'hinge' is 0, which contradicts what was given before"):
+            with_joints(scene, {"hinge": 0.0})
 
 
 NO_JOINTS = {

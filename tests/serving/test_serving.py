@@ -6,7 +6,6 @@ import http.server
 import io
 import json
 import os
-import re
 import runpy
 import signal
 import socket
@@ -20,6 +19,7 @@ from dataclasses import replace
 from pathlib import Path
 from random import Random
 from typing import Any
+from urllib.parse import urlencode
 
 import numpy as np
 import pytest
@@ -41,6 +41,7 @@ import uvicorn
 from analytic import AnalyticModel
 from camera_files import write_camera
 from fuzz import damaged, zipped
+from page_blocks import blocks
 from PIL import Image
 from robot_files import LAPTOP
 from two_balls import NAMES, fronts, two_balls
@@ -52,6 +53,7 @@ from mereo.io.config import InputConfig
 from mereo.io.sensor_frame import read_frame
 from mereo.models.config import InferenceConfig
 from mereo.models.model import Model
+from mereo.scenes.files.object_files import scene_of_meshes
 from mereo.scenes.random_states import CACHE_VARIABLE
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
@@ -68,6 +70,7 @@ from mereo_serving.workers import WorkerDied, WorkerProcess
 
 pytestmark = pytest.mark.anyio
 
+PAGE = Path(__file__).parents[2] / "docs/serving.md"
 NPY = {"Content-Type": "application/x-npy"}
 CLOUD = fronts(-1.0)
 MIDDLE, HALF = (CLOUD.min(axis=0) + CLOUD.max(axis=0)) / 2, np.ptp(CLOUD, axis=0).max() / 2
@@ -249,19 +252,46 @@ async def test_a_depth_image_is_registered_as_alone(tmp_path: Path, rope: Model,
         assert again.content == alone.save(tmp_path / "segments.glb").read_bytes()
 
 
-async def test_the_joints_of_a_mechanism_are_in_its_answer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def laptop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Setup:
+    """A laptop alone, with a frame of it in ``frame.npy`` of the working folder."""
     pytest.importorskip("yourdfpy", reason="yourdfpy (extra `robot`) is not installed")
     monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path / "cache"))
-    path = tmp_path / "laptop.urdf"
-    path.write_text(LAPTOP)
-    laptop = mereo.load_object(path)
-    assert laptop.scene is not None and laptop.scene.unit_m is not None
-    cloud = laptop.scene.unit_m * sample_view(laptop.scene, GenerateConfig(), default_rng(0)).depth.to_points().points
-    joints = mereo.reconstruct(cloud, laptop, unit_m=1.0).joints
-    (tmp_path / "s").mkdir()
-    async with running(tmp_path / "s", given=Setup((Served("balls", object=(str(path),)),), "auto", EXACT)) as server:
-        answer = figures(await server.post(npy(cloud), f"{ADDRESS}?unit-m=1"))
-    assert answer["joints"] == to_json({"hinge": joints["hinge"].facts()}) and answer["verdict"] == "yes"
+    monkeypatch.chdir(tmp_path)
+    Path("s").mkdir()
+    Path("laptop.urdf").write_text(LAPTOP)
+    scene = scene_of_meshes([Path("laptop.urdf")])
+    assert scene.unit_m is not None
+    cloud = scene.unit_m * sample_view(scene, GenerateConfig(), default_rng(0)).depth.to_points().points
+    Path("frame.npy").write_bytes(npy(cloud))
+    return Setup((Served("laptop", object=("laptop.urdf",)),), "auto", EXACT)
+
+
+async def test_joints_are_in_the_answer_and_known_ones_are_of_one_request(tmp_path: Path, laptop: Setup) -> None:
+    address, cloud = "/v1/laptop/reconstruct?unit-m=1", np.load("frame.npy")
+    joints = mereo.reconstruct(cloud, mereo.load_object("laptop.urdf"), unit_m=1.0).joints
+    free, true = to_json({"hinge": joints["hinge"].facts()}), round(joints["hinge"].value, 3)
+    async with running(tmp_path / "s", given=laptop) as server:
+        for given in (None, {"hinge": true}, {"name": ["wheel", "hinge"], "position": [0, true]}, None):
+            query = "" if given is None else f"&{urlencode({'joints': json.dumps(given)})}"
+            answer = figures(await server.post(npy(cloud), address + query))
+            assert answer["verdict"] == "yes" and answer["warnings"] == []
+            if given is None:
+                assert answer["joints"] == free
+            else:
+                hinge = answer["joints"]["hinge"]
+                assert [hinge["value"], *hinge["interval"]] == pytest.approx([true] * 3, abs=1e-9)
+        for wrong, sentence in WRONG_JOINTS.items():
+            refused = await server.post(npy(cloud), f"{address}&{urlencode({'joints': wrong})}")
+            assert (refused.status_code, refused.json()) == (422, {"error": sentence})
+
+
+WRONG_JOINTS = {
+    '{"hinge": 86}': "joint 'hinge' is 86; its limits are 0.3 to 2.2 rad: give radians, correct it, or add `within`",
+    '{"lid": 1}': "no joint is called 'lid'; it must be one of hinge: correct it",
+    "{hinge: 1}": "joints is '{hinge: 1}'; it must be JSON: correct it",
+    '"laptop.urdf"': "joints is 'laptop.urdf'; it must be a valid dictionary: correct it",  # no file is read
+}
 
 
 def clouds(count: int) -> Iterator[ndarray]:
@@ -460,8 +490,8 @@ async def test_the_end_answers_what_is_begun_and_refuses_the_rest(tmp_path: Path
 
 
 @contextmanager
-def listening(folder: Path) -> Iterator[int]:
-    worker = ThreadWorker(Answerer.of(setup()))
+def listening(folder: Path, given: Setup | None = None) -> Iterator[int]:
+    worker = ThreadWorker(Answerer.of(given or setup()))
     server = Server(folder, [worker], ServeConfig())
     settings = uvicorn.Config(server.app, http="h11", ws="none", log_level="critical", lifespan="on")
     running_server = uvicorn.Server(settings)
@@ -480,7 +510,7 @@ def listening(folder: Path) -> Iterator[int]:
 def test_the_documented_client_works(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (Path(__file__).parents[2] / "docs/serving.md").read_text(), re.DOTALL)
+    code, _ = blocks(PAGE, "python")
     assert len(code.splitlines()) <= 16
     (tmp_path / "s").mkdir()
     np.save(tmp_path / "cloud.npy", CLOUD)
@@ -504,6 +534,15 @@ def test_the_documented_client_works(
         with socket.create_connection(("127.0.0.1", port), timeout=20) as line:
             line.sendall(b"POST /v1/balls/reconstruct HTTP/1.1\r\nHost: localhost\r\nContent-Length: -5\r\n\r\n")
             assert line.recv(100).startswith(b"HTTP/1.1 400")
+
+
+def test_the_documented_joints_are_kept(tmp_path: Path, laptop: Setup, monkeypatch: pytest.MonkeyPatch) -> None:
+    client, address = blocks(PAGE, "python")
+    monkeypatch.setattr(sys, "argv", ["client.py", "frame.npy"])
+    with listening(tmp_path / "s", laptop) as port:
+        code = client.replace("request = ", f"{address}request = ", 1).replace(":8000", f":{port}")
+        Path("client.py").write_text(code)
+        assert runpy.run_path("client.py")["found"]["joints"]["hinge"]["value"] == pytest.approx(1.51, abs=1e-9)
 
 
 # --- names and options ------------------------------------------------------------------------------------------------
@@ -600,7 +639,7 @@ REFUSED = {
     "an unknown parameter": (422, "there is no parameter 'unitm'", asked("unitm=1")),
     "a word for a number": (422, "unit-m is 'mm'; it must be a valid number", asked("unit-m=mm")),
     "a negative unit": (422, "the unit is -1.0 m; it must be positive", asked("unit-m=-1")),
-    "half a range": (422, "depth-range has 1 numbers; it needs 2", asked("depth-range=1")),
+    "half a range": (422, "depth-range is ['1']; it must be 2 numbers: correct it", asked("depth-range=1")),
     "too many cells": (422, "resolution is 9999; it must be a whole number, from 4 to 256", asked("resolution=9999")),
     "a mask for a cloud": (422, "is read as a point cloud; leave out", form(mask=b"x")),
     "two cameras": (422, "intrinsics are given twice", asked("intrinsics=1", **form(intrinsics=b"x"))),

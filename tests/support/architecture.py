@@ -127,7 +127,7 @@ BUDGET = {
     "src/mereo": (307_400, 162),
     "src/mereo_learning": (47_420, 22),
     "src/mereo_objects": (40_000, 28),
-    "src/mereo_serving": (10_700, 13),
+    "src/mereo_serving": (10_640, 13),
     "src/mereo_viewer": (12_030, 5),
     "src/mereo_experiments": (11_850, 17),
     "tests": (296_200, 138),

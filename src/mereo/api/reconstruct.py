@@ -347,7 +347,8 @@ class Tracker:
             executor: what searches for a lost object; by default a thread of the tracker's own.
             isolation: what of each frame is left out, as in ``reconstruct``.
             initial_pose: rough pose of the object in the first frame, as in ``reconstruct``.
-            joints: values that are known and stay as they are, as in ``reconstruct``; ``follow`` takes others.
+            joints: values that are known and stay as they are, as in ``reconstruct``; ``follow`` takes others of each
+                frame, which may narrow these but not contradict them.
 
         Raises ``ValueError`` for other methods and poses, and for weights without a deformation model.
         """
@@ -377,7 +378,7 @@ class Tracker:
             frame: whatever ``load_frame`` takes, or what it has returned; in one unit throughout the sequence.
             time_s: of the frame, seconds from any zero, later than the last one's.
             isolation: what of the frame is left out, where that is not as of the tracker.
-            joints: values that are known at that time, as in ``reconstruct``.
+            joints: values that are known at that time, as in ``reconstruct``, besides those of the tracker.
             options: as in ``reconstruct``: fields of ``isolation`` by themselves, and arguments of ``load_frame``.
 
         Raises ``ValueError`` for unusable frames, after which the sequence may go on. Surfaces, labels and figures are

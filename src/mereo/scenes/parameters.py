@@ -352,8 +352,9 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
             or metres of joints that slide. Or lists ``name`` and ``position``, as a dict or a ``JointState`` of ROS,
             of which joints that the scene lacks are passed over. Or a YAML or JSON file of either.
 
-    A joint that follows another one gives that one's value. Raises ``FileNotFoundError``, and ``ValueError`` where the
-    scene has no joints with names, for names that none has, values beyond limits, and two that contradict.
+    A joint that follows another one gives that one's value. What was given before still holds: a value within it
+    narrows it, and another one contradicts it. Raises ``FileNotFoundError``, and ``ValueError`` where the scene has no
+    joints with names, for names that none has, values beyond limits, and two that contradict.
     """
     motion = None if scene is None else scene.sample_deformations
     if scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
@@ -371,13 +372,16 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
     for name, (value, within) in _values(given, list(motion.joints)).items():
         joint, _ = motion.joints[name]
         leader = joint.follows or name
-        least, most = _shares(joint, value, within, scene.unit_m or 1.0)
-        before = shares.get(leader, (least, most))
-        least, most = shares[leader] = max(least, before[0]), min(most, before[1])
+        given_before = motion.joints[leader][0].shares
+        before = shares.get(leader, given_before)
+        least, most = _shares(joint, value, within, before, scene.unit_m or 1.0)
+        if before != (0.0, 1.0):  # of a joint of which nothing is known a whole turn goes on beyond its limits
+            least, most = max(least, before[0]), min(most, before[1])
         if least > most + ROUNDING:
-            raise ValueError(
-                f"joint {name!r} is {value:.6g}, which contradicts others that move with it: give {leader!r} alone"
-            )
+            others = "others that move with it" if before != given_before else "what was given before, with the object"
+            cure = f"give {leader!r} alone" if before != given_before else "leave one of both out"
+            raise ValueError(f"joint {name!r} is {value:.6g}, which contradicts {others}: {cure}")
+        shares[leader] = min(least, most), most
     return replace(scene, sample_deformations=motion.narrowed(shares))
 
 
@@ -449,15 +453,17 @@ def _values(given: Any, names: list[str]) -> dict[str, Range]:
     return values
 
 
-def _shares(joint: JointSampler, value: float, within: float, unit_m: float) -> Range:
-    """Least and greatest share of a joint's range by its value in radians or metres."""
+def _shares(joint: JointSampler, value: float, within: float, before: Range, unit_m: float) -> Range:
+    """Least and greatest share of a joint's range by its value in radians or metres, of the turn of those before."""
     stated = value
     unit, turn, name = (1.0, 2 * pi, "rad") if joint.turns else (unit_m, np.inf, "m")
     first, second = (unit * limit for limit in joint.limits)
+    goes_on = abs(second - first) > turn - ROUNDING
     if joint.turns:  # a whole turn more is the same state
-        value -= turn * round((value - (first + second) / 2) / turn)
+        middle = sum(before) / 2 if goes_on else 0.5
+        value -= turn * round((value - first - middle * (second - first)) / turn)
     low, high = sorted((value + side - first) / (second - first) for side in (-within, within))
-    if abs(second - first) > turn - ROUNDING:  # beyond the limits of a whole turn it goes on
+    if goes_on:  # beyond the limits of a whole turn
         return low, high
     if low > 1 + ROUNDING or high < -ROUNDING:
         least, most = sorted((first, second))
