@@ -78,7 +78,8 @@ def measure(name: str, sensors: list[Sensor], rows: list[int], views: int) -> No
             start = time.perf_counter()
             found = score_cases(model, case, views, False, registrar_for(model, "modes", scene))
             seconds = (time.perf_counter() - start) / views
-            network = intersection_over_union(found.answers["network"].confusion, model.segmented)
+            assert found.network is not None
+            network = intersection_over_union(found.network.confusion, model.segmented)
             scores = (f"{score.iou:.3f} / {score.miou:.3f}" for score in (network, found.scores))
             registered = np.mean([source != "network" for source in found.sources])
             where = (sensor, f"{distance_m:g}", f"{size}{' binned' if bins else ''}", f"{points:.0f}")

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
@@ -281,53 +281,6 @@ class Reliability:
 
 # --- answers to a test case -------------------------------------------------------------------------------------------
 
-AnswerName = Literal["network", "modes", "full"]
-"""Who answers: the network alone, the registered modes, the better of these and the scene's own parameters."""
-
-
-@dataclass(frozen=True, eq=False)
-class Candidate:
-    """One answer to a frame.
-
-    Attributes:
-        labels: on the grid of the truth.
-        seconds: from the cloud to the answer.
-        registration: behind it; None for the network's.
-    """
-
-    labels: UInt8[np.ndarray, "x y z"]
-    seconds: float
-    registration: Registration | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class Candidates:
-    """All answers to a frame.
-
-    Attributes:
-        code: what the network made of the cloud.
-        each: answers by who gives them.
-        default: whose answer a user gets.
-        known: whether the frame is said to show the object; None where no registration was asked for.
-        seconds: from the cloud to the answer that a user gets, all that led to it included.
-    """
-
-    code: EncodedCloud
-    each: dict[AnswerName, Candidate]
-    default: AnswerName
-    known: Known | None = None
-    seconds: float = 0.0
-
-    @property
-    def answer(self) -> Candidate:
-        """The answer that a user gets."""
-        return self.each[self.default]
-
-    @property
-    def source(self) -> str:
-        """Where that answer comes from: network, rest, modes or draws."""
-        return "network" if self.answer.registration is None else self.answer.registration.method
-
 
 def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8[np.ndarray, "x y z"]:
     """Labels by the network at the voxels of a grid, evaluated coarse to fine."""
@@ -337,38 +290,6 @@ def network_labels(model: Trained, code: EncodedCloud, grid: LabelGrid) -> UInt8
         return model.logits(code, points)
 
     return sample_coarse_to_fine(logits, grid.origin, grid.spacing, (x, y, z)).labels
-
-
-def find_candidates(
-    model: Trained, cloud: PointCloud, grid: LabelGrid, registrar: Registrar | None, scene_unit: float | None
-) -> Candidates:
-    """Answers to a frame, scored on a grid: the one that a user gets, and all others that led to it."""
-    answer = answer_frame(observe(cloud), model, registrar, scene_unit=scene_unit)
-    code, encoding = answer.encoded.code, answer.encoded.timings_s["encode"]
-    assert answer.candidate is not None and code is not None
-    started = time.perf_counter()
-    labels = network_labels(model, code, grid)
-    network = Candidate(labels, encoding + time.perf_counter() - started)
-    if registrar is None:
-        return Candidates(code, {"network": network}, "network", seconds=network.seconds)
-    known, names = answer.recognition.known, names_for(registrar)
-    if answer.candidate.modes is None or answer.registration is None:  # nothing was found, whoever is scored
-        return Candidates(code, dict.fromkeys(names, network), "network", known, answer.seconds)
-    registrations = {"modes": answer.candidate.modes.registration, "full": answer.registration}
-    each: dict[AnswerName, Candidate] = {"network": network}
-    for name in names[1:]:
-        fit = registrations[name]
-        each[name] = Candidate(label_grid(fit.mesh, *grid.axes()), encoding + fit.seconds, fit)
-    return Candidates(code, each, names[-1] if answer.taken else "network", known, answer.seconds)
-
-
-def names_for(registrar: Registrar | None) -> tuple[AnswerName, ...]:
-    """Names of the answers that can be had: the scene's parameters only of an object whose scene is there."""
-    if registrar is None:
-        return ("network",)
-    if registrar.method == "modes" or registrar.states_or_none is None:
-        return ("network", "modes")
-    return ("network", "modes", "full")
 
 
 # --- results of a test set --------------------------------------------------------------------------------------------
@@ -397,6 +318,10 @@ class EvaluatedView:
     colors: Sequence[Color]
 
 
+TimedConfusion = tuple[Int[np.ndarray, "c c"], float]
+"""Confusion matrix of a test case, and the seconds from the cloud to the answer."""
+
+
 @dataclass(frozen=True, eq=False)
 class AnswerScores:
     """Scores of one of the answers over a test set.
@@ -415,9 +340,7 @@ class AnswerScores:
     miou_up_to_symmetry: float
 
     @classmethod
-    def of(
-        cls, cases: Sequence[tuple[Int[np.ndarray, "c c"], float]], segmented: bool, swaps: Sequence[Sequence[int]]
-    ) -> "AnswerScores":
+    def of(cls, cases: Sequence[TimedConfusion], segmented: bool, swaps: Sequence[Sequence[int]]) -> "AnswerScores":
         """Scores of a set by each case's confusion matrix and seconds; swaps are those of ``StatisticalModel``."""
         each = tuple(intersection_over_union(confusion, segmented) for confusion, _ in cases)
         exchanged = sum(with_segments_exchanged(confusion, swaps) for confusion, _ in cases)
@@ -439,8 +362,8 @@ class Evaluation:
         examples: scores of each test case by its name.
         views: the first few with their labels, for pictures.
         segmented: whether the model tells segments apart; without, there is no mIoU (NaN).
-        answers: the same of each that could have answered; ``confusion`` and ``examples`` are of what a user gets.
-        sources: where that answer came from, in each example: network, modes or draws.
+        network: the same of the network alone; ``confusion`` and ``examples`` are of what a user gets.
+        sources: where that answer came from, in each example: network, rest, modes or draws.
         known: whether each example was said to show the object, where a registration was asked for.
         errors: distances of registered points from their true positions, where a registration was taken.
         unit_mm: millimetres per scene unit, where they are known.
@@ -455,7 +378,7 @@ class Evaluation:
     examples: dict[str, Scores]
     views: tuple[EvaluatedView, ...] = field(default=())
     segmented: bool = True
-    answers: dict[AnswerName, AnswerScores] = field(default_factory=dict)
+    network: AnswerScores | None = None
     sources: tuple[str, ...] = ()
     known: tuple[Known, ...] = ()
     errors: RegistrationErrors | None = None
@@ -517,25 +440,23 @@ class ScoredCase:
 
     Attributes:
         name: its own.
-        each: confusion matrix and seconds of each answer, by who gives it.
-        default: whose answer a user gets.
-        source: where that comes from.
+        answer: confusion matrix of the answer that a user gets, and seconds from the cloud to it.
+        network: the same of the network alone.
+        source: where the answer comes from: network, rest, modes or draws.
         reliability: of the network's probabilities on this case.
         errors: of the registration behind the answer; None without one, or without known true positions.
         view: labels for a picture; None where none is wanted.
-        known: as ``Candidates`` has it.
-        seconds: as ``Candidates`` has them.
+        known: whether the frame is said to show the object; None where no registration was asked for.
     """
 
     name: str
-    each: dict[AnswerName, tuple[Int[np.ndarray, "c c"], float]]
-    default: AnswerName
+    answer: TimedConfusion
+    network: TimedConfusion
     source: str
     reliability: Reliability
     errors: RegistrationErrors | None
     view: EvaluatedView | None
     known: Known | None = None
-    seconds: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -569,49 +490,54 @@ class Scoring:
     def __call__(self, index: int) -> ScoredCase:
         """Score a case."""
         case, (model, registrar) = self.case(index), self.moved
-        candidates = find_candidates(model, case.cloud, case.truth.grid, registrar, case.scene_unit)
-        names, colors = segment_names(model)
-        registration, errors = candidates.answer.registration, None
-        if registration is not None and case.material is not None and case.scene_unit is not None:
-            truth = nearest_truth(registration.model, registration.material, case.material(registration.model))
-            seen = seen_points(truth, case.cloud, case.scene_unit)
-            errors = RegistrationErrors.of(registration, truth, seen, case.scene_unit)
+        names, grid, errors = segment_names(model)[0], case.truth.grid, None
+        answer = answer_frame(observe(case.cloud), model, registrar, scene_unit=case.scene_unit)
+        code, seconds = answer.encoded.code, answer.encoded.timings_s["encode"]
+        assert code is not None
+        started = time.perf_counter()
+        labels = network_labels(model, code, grid)
+        network = grid_confusion(case.truth, labels, len(names)), seconds + time.perf_counter() - started
+        confusion, registration = network[0], answer.registration if answer.taken else None
+        if registration is not None:
+            confusion = grid_confusion(case.truth, label_grid(registration.mesh, *grid.axes()), len(names))
+            if case.material is not None and case.scene_unit is not None:
+                truth = nearest_truth(registration.model, registration.material, case.material(registration.model))
+                seen = seen_points(truth, case.cloud, case.scene_unit)
+                errors = RegistrationErrors.of(registration, truth, seen, case.scene_unit)
         return ScoredCase(
             name=case.name,
-            each={
-                name: (
-                    grid_confusion(case.truth, candidates.each[name].labels, len(names)),
-                    candidates.each[name].seconds,
-                )
-                for name in names_for(registrar)
-            },
-            default=candidates.default,
-            source=candidates.source,
-            reliability=Reliability.of_view(model, candidates.code, case.truth),
+            answer=network if registrar is None else (confusion, answer.seconds),
+            network=network,
+            source="network" if registration is None else registration.method,
+            reliability=Reliability.of_view(model, code, case.truth),
             errors=errors,
-            view=_evaluated_view(case, model, candidates, colors) if index < self.kept else None,
-            known=candidates.known,
-            seconds=candidates.seconds,
+            view=_evaluated_view(case, model, code, registration) if index < self.kept else None,
+            known=None if registrar is None else answer.recognition.known,
         )
 
 
-def _evaluated_view(case: TestCase, model: Trained, candidates: Candidates, colors: Sequence[Color]) -> EvaluatedView:
+def _evaluated_view(
+    case: TestCase, model: Trained, code: EncodedCloud, registration: Registration | None
+) -> EvaluatedView:
     """Truth and answer on the truth's grid and ``PICTURE_MARGIN`` cells around it, which are empty in truth."""
-    grid, registration = case.truth.grid, candidates.answer.registration
+    grid, colors = case.truth.grid, segment_names(model)[1]
     labels = np.pad(grid.labels, PICTURE_MARGIN)
     wide = replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing)
     if registration is None:
-        predicted = network_labels(model, candidates.code, wide)
+        predicted = network_labels(model, code, wide)
     else:
         predicted = label_grid(registration.mesh, *wide.axes())
     reference = np.minimum(labels, np.uint8(len(colors)))
     return EvaluatedView(case.name, case.cloud, reference, predicted, wide.origin, wide.spacing, colors)
 
 
-def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence[AnswerName]) -> Evaluation:
-    """Result of a test set from its cases, in order, which all have these answers."""
+def evaluation_of(model: Trained, cases: Sequence[ScoredCase]) -> Evaluation:
+    """Result of a test set from its cases, in order."""
     swaps = () if model.statistical_model is None else model.statistical_model.swaps
-    scores = AnswerScores.of([case.each[case.default] for case in cases], model.segmented, swaps)
+    scores, network = (
+        AnswerScores.of(each, model.segmented, swaps)
+        for each in ([case.answer for case in cases], [case.network for case in cases])
+    )
     errors = [case.errors for case in cases if case.errors is not None]
     return Evaluation(
         names=segment_names(model)[0],
@@ -619,14 +545,12 @@ def evaluation_of(model: Trained, cases: Sequence[ScoredCase], answers: Sequence
         examples={case.name: example for case, example in zip(cases, scores.examples, strict=True)},
         views=tuple(case.view for case in cases if case.view is not None),
         segmented=model.segmented,
-        answers={
-            name: AnswerScores.of([case.each[name] for case in cases], model.segmented, swaps) for name in answers
-        },
+        network=network,
         sources=tuple(case.source for case in cases),
         known=tuple(case.known for case in cases if case.known is not None),
         errors=RegistrationErrors.together(errors) if errors else None,
         reliability=Reliability(np.sum([case.reliability.bins for case in cases], axis=0)),
         calibrated=model.calibrates,
-        seconds=tuple(case.seconds for case in cases),
+        seconds=scores.seconds,
         miou_up_to_symmetry=scores.miou_up_to_symmetry,
     )

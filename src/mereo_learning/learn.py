@@ -168,8 +168,8 @@ def _scored_s(examples: int, rates: Rates) -> float:
 # --- learn ------------------------------------------------------------------------------------------------------------
 
 PLAN, METRICS = "plan.json", "metrics.json"
-"""What was decided, with the measurements behind it; scores of the search alone and, where there are weights, of the
-network alone and of both, and which to use."""
+"""What was decided, with the measurements behind it; scores of the search alone and, where there are weights, of both,
+and which to use."""
 
 DATA, RUN, TEST = "data", "run", "test"
 
@@ -508,23 +508,20 @@ class Trial(Trainer):
 GOOD = 0.7
 """mIoU (IoU of an object in one piece) below which an answer is not to be relied upon."""
 
-TITLES = {"search": "search alone", "network": "network alone", "both": "both: network first, search where unexplained"}
+TITLES = {"search": "search alone", "both": "both: network first, search where unexplained"}
 
 
 def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str, Any]:
     """Content of ``metrics.json`` of an object that was trained: the answers, each with its scores, and the best."""
-    slowest = next(test[name] for name in ("full", "modes", "network") if name in test)
     both = {
         "iou": test["iou"],
         "miou": test["miou"],
         "miou_up_to_symmetry": test["miou_up_to_symmetry"],
         "explained": 1 - test["chosen"]["network"],
-        "seconds": test.get("seconds") or slowest["seconds"],  # files of older versions have no seconds of their own
+        "seconds": test["seconds"],
     }
-    network = {name: test["network"][name] for name in ("iou", "miou", "miou_up_to_symmetry", "seconds")}
-    table = {"search": search, "network": network, "both": both}
-    method, reason = best_method(table)
-    best = table["both" if method == "auto" else method]
+    method, reason = best_method(search, both)
+    best = both if method == "auto" else search
     return {
         "trained": True,
         "method": method,
@@ -533,7 +530,8 @@ def _comparison(search: Mapping[str, Any], test: Mapping[str, Any]) -> dict[str,
         "iou": best["iou"],
         "miou": best["miou"],
         "miou_up_to_symmetry": best["miou_up_to_symmetry"],
-        **table,
+        "search": search,
+        "both": both,
     }
 
 
@@ -547,8 +545,7 @@ def _show_outcome(
     for name, title in TITLES.items():
         if name in metrics:
             scores = metrics[name]
-            explained = f"{scores['explained']:.0%}" if "explained" in scores else "-"
-            figures = f"{format_score(scores['iou'])}  {format_score(scores['miou']):>5} {explained:>9}"
+            figures = f"{format_score(scores['iou'])}  {format_score(scores['miou']):>5} {scores['explained']:>9.0%}"
             print(f"{title:<45} {figures} {scores['seconds']:10.2f}")
     if metrics["miou"] is not None and metrics["miou_up_to_symmetry"] > metrics["miou"] + CLEARLY:
         either = format_score(metrics["miou_up_to_symmetry"])

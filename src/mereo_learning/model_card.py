@@ -31,9 +31,6 @@ HEADER_BYTES = 4_000
 
 PLAIN_CHARACTERS = "abcdefghijklmnopqrstuvwxyz0123456789-_"
 
-ANSWERS = {"network": "the network alone", "modes": "registered modes", "full": "with the draws of the scene"}
-"""Who could have answered a test, and the words for it."""
-
 
 def release(
     weights: str | Path, name: str, output: str | Path, tests: Sequence[Path] = (), force: bool = False
@@ -141,19 +138,18 @@ def _training(made: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _result(test: Mapping[str, Any]) -> str:
-    """Table of a test's scores under its title, and a line on who else could have answered."""
+    """Table of a test's scores under its title, and a line on the network alone."""
     if "scans" in test:
         title = f"{len(test['scans'])} real scans ({', '.join(test['scans'])})"
     else:
         title = f"{test['examples']} synthetic views, test seed {test['seed']}, {_camera(test)}"
     scores = {"IoU": test["iou"], "mIoU": test["miou"], **test["per_segment"]}
     rows = [" | ".join(scores), "---|" * len(scores), " | ".join(map(format_score, scores.values()))]
-    each = [
-        f"{name} {format_score(test[key]['iou'])} / {format_score(test[key]['miou'])} in {test[key]['seconds']:.2f} s"
-        for key, name in ANSWERS.items()
-        if test.get(key) is not None
-    ]
-    others = f"\n\nBy who answers (IoU / mIoU, seconds of a frame): {', '.join(each)}." if len(each) > 1 else ""
+    alone, seconds = test.get("network"), test.get("seconds")
+    others = ""
+    if alone is not None and seconds is not None:
+        score = f"{format_score(alone['iou'])} / {format_score(alone['miou'])} in {alone['seconds']:.2f} s"
+        others = f"\n\nSeconds of a frame: {seconds:.2f}. The network alone (IoU / mIoU): {score}."
     return f"{title}:\n\n| {rows[0]} |\n|{rows[1]}\n| {rows[2]} |{others}"
 
 

@@ -33,7 +33,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 from mereo.workers.spread import Cluster, spread
-from mereo_learning.cases import Evaluation, ScoredCase, Scoring, TestCase, evaluation_of, names_for, network_labels
+from mereo_learning.cases import Evaluation, ScoredCase, Scoring, TestCase, evaluation_of, network_labels
 from mereo_learning.scans import SCANS, PosedScan, bunny_posed, read_truth
 
 CELLS = 100
@@ -52,7 +52,7 @@ class EvaluationConfig:
         scans: truth files, or their folders, of ``mereo align``; none of them means the four range scans of the bunny;
             None scores views.
         settings: the camera of the views (image size, noise, sensor); by default the paper's.
-        method: which answer is scored: by default the answer that a user gets, and all others too.
+        method: which answer is scored beside the network's: by default the one that a user gets.
         cells: cells of the grid along each axis.
     """
 
@@ -190,8 +190,9 @@ def score_cases(
         workers: a cluster, where each case is a task; with 1 they are scored here, in order.
     """
     gpu = isinstance(workers, Cluster) and workers.gpus > 0
-    # asking which answers there are draws the states in which a fit begins: once, here, and not in every task
-    scoring, answers = Scoring(model, registrar, case, kept, gpu), names_for(registrar)
+    if registrar is not None:
+        registrar.prepare()  # once, here, and not in every task
+    scoring = Scoring(model, registrar, case, kept, gpu)
     scored: dict[int, ScoredCase] = {}
     with (
         closing(spread(scoring, range(count), workers)) as results,
@@ -200,7 +201,7 @@ def score_cases(
         for number, result in results:
             scored[number] = result
             shown.advance()
-    return evaluation_of(model, [scored[number] for number in range(count)], answers)
+    return evaluation_of(model, [scored[number] for number in range(count)])
 
 
 # --- real scans -------------------------------------------------------------------------------------------------------

@@ -200,8 +200,8 @@ def _read(output: Path, scene: Scene) -> SearchScores:
 TrainChoice = Literal["auto", "always", "never"]
 """When to train: where the search alone is not good enough, in any case, or not at all."""
 
-Method = Literal["auto", "search", "network"]
-"""Who is to answer, as ``--method`` says it: both, the search alone, or the network alone."""
+Method = Literal["auto", "search"]
+"""Who is to answer, as ``--method`` says it: both, or the search alone."""
 
 GOOD_ENOUGH = 0.85
 """mIoU up to symmetry from which the search alone is good enough; IoU of an object in one segment."""
@@ -235,24 +235,23 @@ def training_reason(choice: TrainChoice, reasons: list[str], is_begun: bool) -> 
     return "--train is always" if choice == "always" else f"the search alone is not good enough, {', '.join(reasons)}"
 
 
-def best_method(table: Mapping[str, Mapping[str, Any]]) -> tuple[Method, str]:
-    """Choose who is to answer, with the reason in a sentence.
+def best_method(search: Mapping[str, Any], both: Mapping[str, Any]) -> tuple[Method, str]:
+    """Choose who is to answer, the search alone or both, with the reason in a sentence.
 
-    Of the search alone and both, that with the clearly higher mIoU is taken (by ``CLEARLY``), else that which explains
-    more views, else the faster one; the network alone, which registers nothing, only where it is clearly better still.
+    That with the clearly higher mIoU is taken (by ``CLEARLY``), else that which explains more views, else the faster
+    one.
 
     Args:
-        table: IoU, mIoU up to symmetry, explained share and seconds of "search", "network" and "both", on the same
-            views.
+        search: IoU, mIoU up to symmetry, explained share and seconds of the search alone.
+        both: the same of both, on the same views.
     """
-    miou = {name: row["miou_up_to_symmetry"] for name, row in table.items()}
-    scores = {name: float(row["iou"] if miou[name] is None else miou[name]) for name, row in table.items()}
-    search, both = table["search"], table["both"]
-    if scores["network"] > max(scores["search"], scores["both"]) + CLEARLY:
-        return "network", f"use the network alone: mIoU {_than(scores, 'network', 'both')}"
-    if abs(scores["both"] - scores["search"]) > CLEARLY:
-        is_both = scores["both"] > scores["search"]
-        reason = f"mIoU {_than(scores, 'both', 'search') if is_both else _than(scores, 'search', 'both')}"
+    scores = [
+        float(row["iou" if row["miou_up_to_symmetry"] is None else "miou_up_to_symmetry"]) for row in (both, search)
+    ]
+    if abs(scores[0] - scores[1]) > CLEARLY:
+        is_both = scores[0] > scores[1]
+        better, worse = (format_score(score) for score in sorted(scores, reverse=True))
+        reason = f"mIoU {better}, not {worse} of {'the search alone' if is_both else 'both'}"
     elif both["explained"] != search["explained"]:
         is_both = both["explained"] > search["explained"]
         shares = f"{both['explained']:.0%} of the views by both, {search['explained']:.0%} by the search alone"
@@ -262,8 +261,3 @@ def best_method(table: Mapping[str, Mapping[str, Any]]) -> tuple[Method, str]:
         times = f"{both['seconds']:.2f} s a frame with both, {search['seconds']:.2f} s with the search alone"
         reason = f"as good as {'the search alone' if is_both else 'both'}, and faster, {times}"
     return ("auto", f"use both: {reason}") if is_both else ("search", f"use the search alone: {reason}")
-
-
-def _than(scores: Mapping[str, float], name: str, other: str) -> str:
-    titles = {"search": "of the search alone", "both": "of both"}
-    return f"{format_score(scores[name])}, not {format_score(scores[other])} {titles[other]}"

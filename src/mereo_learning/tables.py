@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, ValidationError
 
 from mereo.geometry.conventions import WorkspaceName
-from mereo.geometry.metrics import Scores, format_score, intersection_over_union
+from mereo.geometry.metrics import format_score, intersection_over_union
 from mereo.io.errors import first_problem, readable
 from mereo.synthesis.config import SensorConfig
 from mereo_learning.cases import AnswerScores, Evaluation
@@ -22,9 +22,8 @@ CLEARLY = 0.01
 def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
     """Content of ``metrics.json``: ``facts`` first, then definition, scores and confusion matrix.
 
-    The part that compares who could have answered (network, modes, full) has ``miou_tenth`` of each, the mIoU that a
-    tenth of its examples do not reach. ``chosen`` has the share of examples by where the scored answer came from,
-    ``better`` the share in which another answer would have been better than it by more than ``CLEARLY``.
+    Of the network alone there is also ``miou_tenth``, the mIoU that a tenth of its examples do not reach. ``chosen``
+    has the share of examples by where the scored answer came from.
     ``registration_error`` and ``coverage95``, the share of true positions within the registration's radii, are None
     where none was taken, and so is ``known``, the share of examples by whether they are said to show the object, where
     no registration was asked for.
@@ -54,26 +53,15 @@ def metrics(evaluation: Evaluation, facts: dict[str, Any]) -> dict[str, Any]:
         "ece": evaluation.reliability.ece,
         "calibrated": evaluation.calibrated,
         "reliability": evaluation.reliability.facts(),
-        **{name: _answer(answer, evaluation.segmented) for name, answer in evaluation.answers.items()},
+        **({} if evaluation.network is None else {"network": _answer(evaluation.network, evaluation.segmented)}),
         "chosen": {
             name: evaluation.sources.count(name) / max(1, len(evaluation.sources))
             for name in ("network", "rest", "modes", "draws")
         },
-        "better": {name: _share_better(answer, evaluation) for name, answer in evaluation.answers.items()},
         "registration_error": None if errors is None else errors.summary(evaluation.unit_mm),
         "coverage95": None if errors is None else errors.coverage(evaluation.unit_mm),
         "known": {word: words.count(word) / len(words) for word in ("true", "unsure", "false")} if words else None,
     }
-
-
-def _share_better(answer: AnswerScores, evaluation: Evaluation) -> float:
-    """Share of the examples in which an answer would have been clearly better than the scored one."""
-    pairs = zip(answer.examples, evaluation.examples.values(), strict=True)
-    return float(np.mean([_value(other) > _value(scored) + CLEARLY for other, scored in pairs]))
-
-
-def _value(scores: Scores) -> float:
-    return scores.iou if np.isnan(scores.miou) else scores.miou
 
 
 def _answer(answer: AnswerScores, segmented: bool) -> dict[str, float]:
@@ -113,14 +101,14 @@ def certainty_lines(metrics: Mapping[str, Any]) -> list[str]:
 def markdown_table(evaluation: Evaluation) -> str:
     """Markdown table of the whole set and the mean over its examples, and a line on the radii; a dash for no score.
 
-    Also a row of the whole set for each who answers, where more than the network could.
+    Also a row of the network alone, where more than it could answer.
     """
     values = metrics(evaluation, {})
     blank = " | ".join("" for _ in evaluation.names)
     rows = [("whole set", values, " | ".join(format_score(value) for value in evaluation.scores.per_segment))]
     rows.append(("mean over examples", values["example_mean"], blank))
-    if len(evaluation.answers) > 1:
-        rows += [(f"{name} alone, {values[name]['seconds']:.2f} s", values[name], blank) for name in evaluation.answers]
+    if evaluation.known and evaluation.network is not None:
+        rows.append((f"network alone, {values['network']['seconds']:.2f} s", values["network"], blank))
     head = f"| {len(evaluation.examples)} examples | IoU | mIoU | {' | '.join(evaluation.names)} |\n"
     return (
         f"{head}|---|---|---|{'---|' * len(evaluation.names)}\n"
@@ -170,8 +158,6 @@ class _Written(_Mean):
     scans: list[str] = []
     example_mean: _Mean | None = None
     network: _Timed | None = None
-    modes: _Timed | None = None
-    full: _Timed | None = None
 
 
 def read_metrics(path: Path) -> dict[str, Any]:
