@@ -17,7 +17,6 @@ from mereo.models.weights import load_model
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.sample_views import load_view
 from mereo_experiments.paper.encoders_losses import ENCODERS, lacks, recipe
-from mereo_experiments.paper.plan import Cost, Plan, cost
 from mereo_experiments.paper.registry import EXPERIMENTS, experiment, run_experiment
 from mereo_experiments.paper.result import Claim, Result, Row, markdown, published, write_result
 from mereo_experiments.paper.scales import SCALES
@@ -25,7 +24,7 @@ from mereo_experiments.paper.store import Score, Store
 from mereo_experiments.speed import report
 from mereo_experiments.speed.stages import Bench, Machine, Rival, Stage, Work, count_operations, needed_nodes
 from mereo_learning.cases import EvaluatedView
-from mereo_learning.config import PRESETS
+from mereo_learning.config import PRESETS, TrainConfig
 from mereo_learning.error_maps import comparison_picture
 
 NAN = float("nan")
@@ -104,13 +103,6 @@ def test_an_encoder_is_compared_like_for_like_or_the_table_says_what_it_lacks() 
     assert recipe(SCALES["paper"], "autodecoder", "ce+l1") == PRESETS["paper-autodecoder"]
 
 
-def test_costs_are_those_of_what_experiments_do() -> None:
-    """By hand: 28,672 of 28,800 examples in 300 passes, steps of 40; three levels of noise on two objects."""
-    assert cost("real-world", "paper") == Cost(1, 28_800, 28_672 * 300, 128)
-    assert cost("noise", "cpu") == Cost(6, 6 * 1536, 6 * 376 * 32, 18 * 32)
-    assert cost("encoders", "paper").trainings == 6 and cost("encoders-losses", "paper").trainings == 5 * 11
-
-
 def test_the_list_says_which_results_are_here(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     result = Result("noise", "Noise", "cpu", (Row("rope", "x", score(0.5, NAN)),), ())
     for folder in ("noise-cpu", "noise-smoke-rope"):
@@ -132,8 +124,14 @@ def toy_view(name: str) -> EvaluatedView:
     return EvaluatedView(name, cloud, truth, np.roll(truth, 1, axis=2), np.zeros(3), np.ones(3), [(255, 0, 0)] * 2)
 
 
-class ToyStore(Plan):
-    """Store whose every network scores and answers alike."""
+class ToyStore(Store):
+    """Store that makes nothing, and whose every network scores and answers alike."""
+
+    def dataset(self, scene: str, settings: GenerateConfig, examples: int) -> Path:
+        return Path(f"{scene}-{settings.noise_std}")
+
+    def run(self, dataset: Path, config: TrainConfig) -> Path:
+        return dataset / "weights.safetensors"
 
     def score(self, weights: Path, settings: GenerateConfig, examples: int, cells: int) -> Score:
         return score(0.8, 0.6)

@@ -156,7 +156,7 @@ class Experiment:
     def run(self) -> None:
         """Run the experiment and print its table, or list all."""
         if self.name == "list":
-            from mereo_experiments.paper.plan import list_experiments
+            from mereo_experiments.paper.registry import list_experiments
 
             list_experiments(self.output)
             return

@@ -7,6 +7,7 @@ from mereo_experiments.paper.store import Score, Store
 from mereo_learning.cases import EvaluatedView
 
 QUESTION = "How well is each object reconstructed and segmented?"
+COST = "cpu: 10 trainings, 1.2 hours; paper: 20 trainings, 115 million examples shown"
 
 OBJECTS = ("rope", "shapes", "robot", "lizard", "sheet", "bunny", "human", "skull", "liver", "engine")
 

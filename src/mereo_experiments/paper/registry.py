@@ -6,19 +6,23 @@ from importlib import import_module
 from pathlib import Path
 from typing import Protocol, cast, get_args, runtime_checkable
 
+from rich.console import Console
+
+from mereo.geometry.brief import counted
 from mereo.io.atomic_files import check_new_directory
 from mereo_experiments.paper.result import Result, write_result
 from mereo_experiments.paper.scales import SCALES, ExperimentName, ExperimentScale
-from mereo_experiments.paper.store import Store
+from mereo_experiments.paper.store import FINISHED, Store
 
 EXPERIMENTS = get_args(ExperimentName)
 
 
 @runtime_checkable
 class Experiment(Protocol):
-    """Module of an experiment: what it answers, on which objects, and how it is run."""
+    """Module of an experiment: what it answers, what it costs (``SCALES``), on which objects, and how it is run."""
 
     QUESTION: str
+    COST: str
     OBJECTS: tuple[str, ...]
     run: Callable[[Store, ExperimentScale], Result]
 
@@ -71,3 +75,20 @@ def _check_results(directory: Path) -> None:
             f"{folder}: move it away or delete it, and run the same command again, which keeps the datasets, runs and "
             "scores and writes these results again"
         ) from None
+
+
+def list_experiments(root: Path) -> None:
+    """Print each experiment with what it answers, its costs and those of its results that a folder holds."""
+    for name in EXPERIMENTS:
+        places = [results_directory(root, name, scale) for scale in SCALES]
+        written = [path.parent.name for place in places for path in root.glob(f"results/{place.name}*/results.json")]
+        results = ", ".join(sorted(folder.removeprefix(f"{name}-") for folder in written)) or "none"
+        print(f"{name}: {experiment(name).QUESTION}\n    {experiment(name).COST}\n    results here: {results}")
+    finished = len(list(root.glob(f"runs/*/{FINISHED}")))
+    Console(markup=False, emoji=False).print(
+        f"\nRun one by: mereo experiment NAME --scale cpu. Results are in {root / 'results'}, each with a table.md. "
+        f"{counted(finished, 'finished training')} there: experiments share them and repeat none. Costs are those of "
+        "an empty folder; hours of one core as they were measured (docs/experiments.md, entry 10). Scale paper is for "
+        "a GPU, on which nobody has timed it; scale smoke takes minutes, and shows only that an experiment runs.",
+        highlight=False,
+    )
