@@ -15,15 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
-from mereo.geometry.camera import PointCloud, into_camera
 from mereo.geometry.conventions import LARGEST, CloudAxes
 from mereo.geometry.downsampling import random_subset
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids
-from mereo.geometry.transforms import Points, Transform, Vector, fit_rigid, inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import Points, Transform, Vector, fit_rigid, rigid, transform_points
 from mereo.io.errors import readable
-from mereo.models.trained import Trained
-from mereo.scenes.rest_pose import rest_frame
 from mereo_learning.icp import (
     CONTACT,
     SEGMENT_LIMITS,
@@ -393,42 +390,6 @@ def misfit(source: Points, target: Points) -> float:
     """RMS distance of pairs of points after the best rigid motion."""
     moved = transform_points(fit_rigid(source, target), source)
     return float(np.sqrt(np.mean(np.sum((target - moved) ** 2, axis=1))))
-
-
-def start_from_model(
-    model: Trained, points: Points, frame: CloudAxes, rest: SegmentedMesh, scale: float | None
-) -> Start:
-    """Rough poses from a trained network: where it believes the seen points were at rest, fitted segment by segment.
-
-    A segment with fewer than 30 points shares the object's pose. Raises ``ValueError`` for another object's model, one
-    without rest coordinates, and an unknown scale.
-    """
-    if model.names != rest.names:
-        raise ValueError(
-            f"the weights know the segments {', '.join(model.names)}, the scene has {', '.join(rest.names)}; they must "
-            "be the same in the same order: use the weights of this object"
-        )
-    T_camera_scan = into_camera(points, frame)
-    code = model.encode(PointCloud(transform_points(T_camera_scan, points)))
-    correspondences = model.correspond(code, code.cloud)
-    if correspondences is None or not model.segmented:
-        raise ValueError(
-            "the weights do not predict rest coordinates of segments, from which a start is made; train with the "
-            "preset base, or give --start FILE"
-        )
-    center, half = rest_frame(rest)
-    source, seen = correspondences[1] * half + center, transform_points(inverse_rigid(T_camera_scan), code.cloud)
-    tolerance = 2 * PAIR_ERROR * diagonal(rest)
-    common = pose_of_pairs(source, seen, "the object by its weights", scale, tolerance)
-    label = model.logits(code, code.cloud)[:, 1:].argmax(axis=1)
-    separate = np.bincount(label, minlength=len(rest.names)) >= 30
-    poses = [
-        pose_of_pairs(source[label == index], seen[label == index], f"segment {name!r}", scale, tolerance)
-        if separate[index]
-        else common
-        for index, name in enumerate(rest.names)
-    ]
-    return Start(np.stack(poses), separate, "weights: not independent of the network")
 
 
 def check_scale(stated: float, scale: float, of: str) -> None:

@@ -33,7 +33,6 @@ class Align:
         scene: a name from `mereo scene list`, or a scene file of your own (.yaml, .py).
         output: folder to create: truth.json, overlay.png, segments.glb.
         start: JSON file with poses or picked point pairs, of the object or of single segments.
-        weights: instead of --start, a shipped name or a file: the network's guess. The truth is then not independent.
         unit: of the scan.
         scene_unit_mm: millimetres per scene unit, where the scene does not say.
         frame: axes of the scan: camera is x right, y down, z forward; scanner is y up, z toward the scanner.
@@ -46,8 +45,7 @@ class Align:
     scan: ScanCloud
     scene: str
     output: Path
-    start: Path | None = None
-    weights: str | None = None
+    start: Path
     unit: Literal["m", "cm", "mm", "in"] = "m"
     scene_unit_mm: PositiveOrUnknown = None
     frame: Literal["camera", "scanner"] = "camera"
@@ -58,36 +56,26 @@ class Align:
 
     def run(self) -> None:
         """Write truth.json, overlay.png and segments.glb into a new folder, and print the residuals."""
-        if (self.start is None) == (self.weights is None):
-            raise ValueError(
-                f"{'no start is' if self.start is None else 'two starts are'} given; one is needed: --start FILE or "
-                "--weights NAME (docs/training.md says how to make a start file)"
-            )
         from mereo.geometry.conventions import UNITS_M
         from mereo.io.atomic_files import new_directory
         from mereo.io.readers import read_point_cloud
         from mereo.io.writers.glb import viewer_rotation, write_segments_glb
-        from mereo.models.weights import load_model
         from mereo.scenes.registry import files_of, is_yaml, load_scene
         from mereo.scenes.scene import SCENES
         from mereo.visualization.contact_sheets import save_png
         from mereo_learning.error_maps import overlay
         from mereo_learning.icp import load_icp
-        from mereo_learning.placement import place, read_start, start_from_model
+        from mereo_learning.placement import place, read_start
         from mereo_learning.scans import TRUTH, ScanFile, write_truth
 
         load_icp()  # its absence is better said before the work
         scan = ScanFile(self.scan, self.unit, self.frame, self.drop_invalid)
-        read = [path for path in (self.scan, *files_of(self.scene), self.start, self.weights) if path is not None]
-        with new_directory(self.output, self.force, read) as directory:
+        with new_directory(self.output, self.force, [self.scan, *files_of(self.scene), self.start]) as directory:
             scene = load_scene(self.scene)
             rest, unit_m = scene.rest, scene.unit_m if self.scene_unit_mm is None else self.scene_unit_mm / 1000
             cloud = read_point_cloud(self.scan, self.drop_invalid)
             scale = None if unit_m is None else unit_m / UNITS_M[self.unit]
-            if self.start is not None:
-                start = read_start(self.start, rest, scale)
-            else:
-                start = start_from_model(load_model(str(self.weights)), cloud.points, self.frame, rest, scale)
+            start = read_start(self.start, rest, scale)
             placement = place(rest, cloud.points, start, self.frame, is_rigid=self.is_rigid, hold=self.hold)
             write_truth(directory, self.output, scan, self.scene, rest, placement, start.how)
             write_segments_glb(
