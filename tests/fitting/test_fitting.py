@@ -177,10 +177,19 @@ def test_the_simpler_description_is_preferred_by_its_evidence(
 ) -> None:
     """Draws are taken where their misfit is lower, or higher by less than what the modes' more free numbers buy."""
     modes = problem.last.misfit(fitted.posed).total
-    bought = narrowing(problem.base, fitted.posed) - narrowing_of_draws(problem, drawn)
+    for motion in (drawn.motion, np.zeros_like(drawn.motion)):  # what is moved by nothing is not narrowed
+        described = replace(drawn, motion=motion)
+        bought = max(narrowing(problem.base, fitted.posed) - narrowing_of_draws(problem, described), 0.0)
+        for gain, taken in ((-5.0, True), (bought - 0.1, True), (bought + 0.1, False)):
+            assert is_drawn(problem, replace(described, misfit=modes + gain), fitted.posed) == taken
     assert bought > 1.0
-    for gain, taken in ((-5.0, True), (0.9 * bought, True), (1.1 * bought, False)):
-        assert is_drawn(problem, replace(drawn, misfit=modes + gain), fitted.posed) == taken
+
+
+def test_a_frame_that_says_nothing_narrows_no_state_whatever_distances_are_kept(fitted: ModesFit) -> None:
+    problem, shown = fitted.problem, narrowing(fitted.problem, fitted.posed)
+    silent = problem.changed(config=replace(problem.config, cloud_weight=0.0, silhouette_weight=0.0))
+    assert shown > 10.0 and len(problem.model.pairs) > 0
+    assert narrowing(silent, fitted.posed) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_second_pass_follows_where_the_first_has_failed(

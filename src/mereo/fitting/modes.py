@@ -224,8 +224,8 @@ def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
 
 # Modes can imitate noise, so their misfit is always lower; the hypothesis that nothing is bent is right when the
 # difference is smaller than what their freedom buys. By Laplace's approximation (MacKay, Neural Computation 1992) that
-# is the logarithm of how much the frame narrows the coefficients, ``log det`` of their posterior precision, as the
-# prior is N(0, 1) each.
+# is the logarithm of how much the frame narrows the coefficients: ``log det`` of their posterior precision, less that
+# of what is known without the frame, N(0, 1) each and the distances that the states keep.
 
 
 def fit_rest(problem: Problem, modes: Posed) -> ScoredFit:
@@ -255,9 +255,9 @@ def resting(problem: Problem, modes: ScoredFit) -> ScoredFit | None:
 
 
 def narrowing(problem: Problem, modes: Posed) -> float:
-    """``NormalEquations.narrowing`` of the modes at a state."""
+    """``NormalEquations.narrowing`` of the modes at a state, beyond that by the distances that the states keep."""
     known = problem.known(modes, Prior.whole(problem.model), 0.0)
-    return problem.seen(known, modes, problem.cloud_sigma, True).narrowing()
+    return problem.seen(known, modes, problem.cloud_sigma, True).narrowing() - known.narrowing()
 
 
 # --- noisy frames -----------------------------------------------------------------------------------------------------

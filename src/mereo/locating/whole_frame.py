@@ -234,14 +234,15 @@ class WholeFrame:
     ) -> "PlacedAnswer | None":
         """Answer to the pixels of a place, by a search in ``rounds``, or without any by a fit from the place's states.
 
-        None where that finds nothing, or something that is not at the frame's point.
+        Both begin at the network's guess as well, where there is a network. None where that finds nothing, or something
+        that is not at the frame's point.
         """
         registrar = self.registrar
         try:
             seen = self.chosen(place)
-            encoded = encode_frame(seen.readings(keep_all)[0], None, seen.frame.axes)
-            states = () if rounds else place.states
-            candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds)
+            encoded = encode_frame(seen.readings(keep_all)[0], registrar.starting_network, seen.frame.axes)
+            states, matches = () if rounds else place.states, registrar.correspondences(encoded.code)
+            candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds, matches)
         except ValueError:
             return None
         if candidate.modes is None or not self.is_at_point(self.explained(candidate.modes.registration.mesh)):
@@ -364,10 +365,10 @@ def answers_in(
 ) -> Iterator[PlacedAnswer]:
     """Answers at the most evident places of a whole frame, until so many at ``most`` are evident themselves.
 
-    First from the states of the quick looks, then, where a better state may win more than the best has, by a round of
-    the search, which takes longer. Places where an evident answer explains most of the pixels are left out, and so are
-    those where a fit finds nothing. Parameters of the object's scene are fitted where it is evident
-    (``WholeFrame.finished``).
+    First from the states of the quick looks and a network's guess, then, where a better state may win more than the
+    best has, by a round of the search, which takes longer. Places where an evident answer explains most of the pixels
+    are left out, and so are those where a fit finds nothing. Parameters of the object's scene are fitted where it is
+    evident (``WholeFrame.finished``).
     """
     places = frame.places()
     hopeful = [place for place in places[: ANSWERS + most - 1] if place.outline.nats > 0]

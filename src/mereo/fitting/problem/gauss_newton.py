@@ -100,10 +100,10 @@ class NormalEquations:
     def narrowing(self) -> float:
         """``log det`` of the coefficients' posterior precision, whatever the pose is; 0 where there are none.
 
-        By so much, in the units of twice a log-likelihood, the frame narrows N(0, 1) coefficients.
+        By so much, in the units of twice a log-likelihood, they are narrower than N(0, 1).
         """
         pose, cross, z = self.matrix[:POSE, :POSE], self.matrix[:POSE, POSE:], self.matrix[POSE:, POSE:]
-        return float(np.linalg.slogdet(z - cross.T @ np.linalg.solve(pose, cross))[1])
+        return float(np.linalg.slogdet(z - cross.T @ np.linalg.pinv(pose) @ cross)[1])
 
 
 def pull(
