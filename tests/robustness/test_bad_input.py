@@ -156,7 +156,7 @@ def test_a_mount_point_is_no_place_for_a_new_folder(tmp_path: Path, monkeypatch:
         "evaluate rope --output {}",
         "generate rope --examples 2 --output {}",
         "train data --output {}",
-        "align cloud.npy --scene rope --weights rope --output {}",
+        "align cloud.npy --scene rope --start start.json --output {}",
         "stream . --weights rope --surfaces {}",
         "scene preview rope --output {}",
         "bench --weights rope --output {}",
