@@ -52,7 +52,7 @@ class EvaluationConfig:
         scans: truth files, or their folders, of ``mereo align``; none of them means the four range scans of the bunny;
             None scores views.
         settings: the camera of the views (image size, noise, sensor); by default the paper's.
-        method: which answer is scored beside the network's: by default the one that a user gets.
+        method: whose answer is scored, and the network's with it: by default the one that a user gets.
         cells: cells of the grid along each axis.
     """
 

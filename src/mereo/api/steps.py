@@ -129,7 +129,7 @@ class Learned:
         scene: name or file of the object's scene.
         frame: point cloud to try it on.
         report: page of the scores; None where nothing was trained.
-        method: whose answers are best, as ``reconstruct`` takes it: "auto", "search" or "network".
+        method: whose answers are best, as ``reconstruct`` takes it: "auto" or "search".
         metrics: scores of each of these on the same test views, as metrics.json in the folder has them.
     """
 

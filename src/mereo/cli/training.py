@@ -192,8 +192,8 @@ class Evaluate:
             around it, at any roll.
         terms: what else is wrong with the depth image.
         inference: where and how exactly the network computes.
-        method: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the network's, the
-            modes' and the draws' own scores too; network the network alone; modes leaves the draws out.
+        method: whose answer is scored: auto is what `mereo reconstruct` gives by default, with the scores of the
+            network alone too; network the network alone; modes leaves the draws out.
         force: replace an existing output folder that mereo wrote, and nothing else is in.
         threads: of torch and all else that computes; 0 means one per core.
         ray: score each view in a task of a Ray cluster: local, one of so many --threads for this run; auto or

@@ -378,8 +378,11 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
         if before != (0.0, 1.0):  # of a joint of which nothing is known a whole turn goes on beyond its limits
             least, most = max(least, before[0]), min(most, before[1])
         if least > most + ROUNDING:
-            others = "others that move with it" if before != given_before else "what was given before, with the object"
-            cure = f"give {leader!r} alone" if before != given_before else "leave one of both out"
+            others, cure = (
+                ("what was given before, with the object", "leave one of both out")
+                if before == given_before
+                else ("others that move with it", f"give {leader!r} alone")
+            )
             raise ValueError(f"joint {name!r} is {value:.6g}, which contradicts {others}: {cure}")
         shares[leader] = min(least, most), most
     return replace(scene, sample_deformations=motion.narrowed(shares))

@@ -103,6 +103,7 @@ class NormalEquations:
         By so much, in the units of twice a log-likelihood, they are narrower than N(0, 1).
         """
         pose, cross, z = self.matrix[:POSE, :POSE], self.matrix[:POSE, POSE:], self.matrix[POSE:, POSE:]
+        # without a frame nothing is known of the pose, whose block has no inverse then
         return float(np.linalg.slogdet(z - cross.T @ np.linalg.pinv(pose) @ cross)[1])
 
 
