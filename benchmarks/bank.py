@@ -248,7 +248,7 @@ def registrar_of(name: str) -> Registrar:
     scene = scene_of(name)
     model = statistical_model_in(name) if name in SHIPPED else kept_model(scene)
     assert model is not None
-    registrar = Registrar(None, model, "auto", scene).checked()
+    registrar = Registrar(None, model, "auto", scene)
     registrar.prepare()
     return registrar
 

@@ -200,7 +200,7 @@ def jitter(registrations: Sequence[Registration | None]) -> str:
 
 
 def alone(registrar: Registrar, cloud: PointCloud) -> Registration | None:
-    candidate = find(observe(cloud), registrar.network, registrar, False, 1.0)[0]
+    candidate = find(observe(cloud), registrar.network, registrar, False, 1.0)
     return None if candidate.modes is None else replace(candidate.modes, rest=None).registration
 
 

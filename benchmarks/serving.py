@@ -264,7 +264,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, default=2.0)
     parser.add_argument("--weights", nargs="+", default=["bunny", "liver"], help="shipped ones that come with a frame")
     parser.add_argument("--frames", type=int, default=12, help="different ones of each weights")
-    parser.add_argument("--method", choices=("network", "auto", "modes", "full"), default="modes")
+    parser.add_argument("--method", choices=("network", "auto", "modes"), default="modes")
     parser.add_argument("--resolution", type=int, default=128)
     parser.add_argument("--workers", type=int, default=0)
     parser.add_argument("--output", type=Path, default=Path("out/serving"), help="folder for serving.json")

@@ -18,6 +18,7 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mereo.fitting.problem.problem import NoFit
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
@@ -491,13 +492,16 @@ class Scoring:
         """Score a case."""
         case, (model, registrar) = self.case(index), self.moved
         names, grid, errors = segment_names(model)[0], case.truth.grid, None
-        answer = answer_frame(observe(case.cloud), model, registrar, scene_unit=case.scene_unit)
+        try:
+            answer = answer_frame(observe(case.cloud), model, registrar, scene_unit=case.scene_unit)
+        except NoFit:  # it shows too little of the object
+            answer = answer_frame(observe(case.cloud), model, None)
         code, seconds = answer.encoded.code, answer.encoded.timings_s["encode"]
         assert code is not None
         started = time.perf_counter()
         labels = network_labels(model, code, grid)
         network = grid_confusion(case.truth, labels, len(names)), seconds + time.perf_counter() - started
-        confusion, registration = network[0], answer.registration if answer.taken else None
+        confusion, registration = network[0], answer.registration
         if registration is not None:
             confusion = grid_confusion(case.truth, label_grid(registration.mesh, *grid.axes()), len(names))
             if case.material is not None and case.scene_unit is not None:

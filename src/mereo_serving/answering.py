@@ -146,7 +146,7 @@ class Answerer:
         seconds = {"read": read_s, **result.reconstruction.timings_s, "write": time.perf_counter() - started}
         headers = {
             "Mereo-Known": str(result.known).lower(),
-            "Mereo-Answer": "registration" if result.taken else "network",
+            "Mereo-Answer": "network" if result.pose is None else "registration",
         }
         return Reply(200, body, frame.media, headers, seconds)
 

@@ -379,12 +379,12 @@ def test_a_lost_object_says_so_in_every_form(results: Results) -> None:
     lost = results["lost"]
     facts = lost.to_dict()
     assert (facts["tracking"], facts["verdict"], facts["segments"]) == ("lost", "no", [])
-    assert facts["registration"]["answer"] is None and not lost and list(lost) == [] and "base" not in lost
+    assert "registration" not in facts and not lost and list(lost) == [] and "base" not in lost
     assert lost.pose is lost.covariance is lost.explained is lost.residual is None
     assert "the object is lost" in repr(lost.transformed(T_BASE))
     with pytest.raises(ValueError, match="^the object is lost: "):
         _ = lost["base"]
-    with pytest.raises(ValueError, match="the network's answer is kept, but .*carry needs a registration"):
+    with pytest.raises(ValueError, match="the network alone answers, and .*carry needs a registration"):
         results["a network"]["big"].pose_in("big")
 
 

@@ -134,16 +134,17 @@ def test_a_result_is_made_again_from_its_own_options(
     assert (first / "labels.npz").read_bytes() == (second / "labels.npz").read_bytes()
 
 
-PLIERS = str(weights_of("pliers"))
+LUMP = str(weights_of("lump"))
 
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, small_previews: None) -> Path:
-    """An empty folder that is the working one, with a frame of the rope, a bowl, and what is no frame."""
+    """An empty folder that is the working one, with a frame of the rope, two bowls, and what is no frame."""
     monkeypatch.chdir(tmp_path)
     np.save("rope.npy", load_view("rope").depth.to_points().points)
     x, y = np.meshgrid(np.linspace(-0.05, 0.05, 20), np.linspace(-0.05, 0.05, 20))
-    np.save("bowl.npy", np.stack([x, y, 0.5 + 20.0 * (x**2 + y**2)], axis=2))
+    for name, depth in (("bowl", 20.0), ("deep", 25.0)):
+        np.save(f"{name}.npy", np.stack([x, y, 0.5 + depth * (x**2 + y**2)], axis=2))
     np.save("text.npy", np.array(["no frame"]))
     return tmp_path
 
@@ -166,15 +167,15 @@ def test_one_frame_is_one_object_and_the_rest_goes_elsewhere(here: Path, capfd: 
 def test_what_is_not_the_object_has_a_status_of_its_own_and_a_failure_outweighs_it(
     here: Path, capfd: pytest.CaptureFixture
 ) -> None:
-    # pliers of some centimetres are no bowl of ten metres, on any processor
-    asked = ("--weights", PLIERS, "--unit-m", "100", "--json", "--output")
+    # a lump is no bowl, on any processor
+    asked = ("--weights", LUMP, "--unit-m", "2", "--json", "--output")
     assert mereo("reconstruct", "bowl.npy", *asked, "one") == 3
     found = json.loads(capfd.readouterr().out)
     assert found["recognition"]["known"] is False and found["verdict"] == "no"
-    assert found["unit_m"] == 100.0
-    assert mereo("reconstruct", "bowl.npy", "rope.npy", *asked, "many") == 3
+    assert found["unit_m"] == 2.0
+    assert mereo("reconstruct", "bowl.npy", "deep.npy", *asked, "many") == 3
     frames = json.loads(capfd.readouterr().out)["frames"]
-    assert [Path(frame["output"]).name for frame in frames] == ["bowl", "rope"]
+    assert [Path(frame["output"]).name for frame in frames] == ["bowl", "deep"]
     assert frames[0]["recognition"] == found["recognition"]
     assert mereo("reconstruct", "rope.npy", "--weights", "rope", "--json", "--output", "known") == 0
     assert json.loads(capfd.readouterr().out)["verdict"] == "yes"

@@ -15,10 +15,10 @@ from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import (
     CONSERVATIVE,
     FEATURELESS,
-    MOST,
     NOT_EVALUATED,
     UNSURE,
     Known,
+    Recognition,
     Signs,
     recognize,
     strangeness,
@@ -102,10 +102,8 @@ def test_the_object_at_rest_is_known_whatever_was_learned(registration: Registra
     assert recognize(odd).known is False and recognize(replace(odd, method="rest")).known is True
 
 
-def test_what_was_not_found_is_not_the_object_and_what_was_not_asked_is_unsure() -> None:
+def test_what_the_network_alone_answers_is_unsure() -> None:
     assert recognize(None) is NOT_EVALUATED and NOT_EVALUATED.known == "unsure"
-    said = recognize(None, refusal="the network finds only 3 points of the object")
-    assert said.known is False and said.strangeness == MOST and said.reason is not None and "3 points" in said.reason
 
 
 def test_calibrated_weights_say_what_is_usual(registration: Registration) -> None:
@@ -187,7 +185,7 @@ def test_a_smooth_patch_is_not_believed(model: StatisticalModel) -> None:
     vars(merged)["self_hidden"] = 0.3  # as if another view's points lay behind: nothing believes it, tracked or not
     again = answer_frame(merged, None, Registrar(None, model)).recognition
     assert again.known == "unsure" and again.reason == merged.doubt and "30% of the points lie behind" in again.reason
-    refused = recognize(None, refusal="too small")
+    refused = Recognition(False, "too small", 5.0)
     assert refused.doubted(merged.doubt) is refused and part.recognition.doubted(None) is part.recognition
 
 

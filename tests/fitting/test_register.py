@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from trimesh.remesh import subdivide
 
 from mereo.fitting.draws.playback import DrawnStates
+from mereo.fitting.problem.problem import NoFit
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame, search_modes
@@ -79,7 +80,7 @@ def iou(view: SampleView, result: Reconstruction) -> float:
 def test_the_answer_is_the_model_itself(found: Answer, model: Model, view: SampleView) -> None:
     result = found.reconstruction
     rest = statistical_model_of(model).rest
-    assert found.taken and result.surfaces.names == rest.names
+    assert result.surfaces.names == rest.names
     for segment, at_rest in zip(result.surfaces.segments, rest.segments, strict=True):
         assert_array_equal(segment.faces, at_rest.faces)
     assert iou(view, result) > 0.5  # .70 to .77, as the last bits of the search fall
@@ -103,13 +104,11 @@ def test_a_scanners_frame_gets_its_answer_in_that_frame(model: Model, view: Samp
         assert_allclose(one.centroid, inside, atol=1e-9)
 
 
-def test_full_needs_a_scene(model: Model) -> None:
+def test_a_scene_is_the_weights_own_or_is_given(model: Model) -> None:
     other = replace(model, provenance={"scene": "mine"})
-    with pytest.raises(ValueError, match="trained on 'mine', which is no built-in scene; .* with --scene, or use"):
-        Registrar.of(other, "full")
-    assert Registrar.of(other, "full", "rope").scene is not None
+    assert Registrar.of(other).scene is None and Registrar.of(other, scene="rope").scene is not None
     with pytest.raises(ValueError, match="the scene 'engine' has other segments or meshes than the weights' own model"):
-        Registrar.of(other, "full", "engine")
+        _ = Registrar.of(other, scene="engine").scene
 
 
 def test_a_scene_that_has_changed_since_is_said_and_not_played(
@@ -127,10 +126,7 @@ def test_a_scene_that_has_changed_since_is_said_and_not_played(
         with pytest.warns(ChangedSceneWarning, match=f"{said}: it has changed since .* only the modes .* train them"):
             assert registrar.finish(fitted).method == "modes"
         assert registrar.states_or_none is None  # said once
-    for given in (None, changed):
-        with pytest.raises(ValueError, match=f"{said}, so its draws .* or use --method modes"):
-            Registrar.of(model, "full", given)
-    with pytest.raises(ValueError, match=f"{said}, so its draws"):  # named as that of other weights
+    with pytest.raises(ValueError, match=f"{said}, so its draws .* or use --method modes"):  # as that of other weights
         assert Registrar.of(replace(model, provenance={"scene": "mine"}), scene=changed).states_or_none
     with pytest.raises(ValueError, match=f"{said}, so places cannot be compared: .* with --method network"):
         evaluate(model, EvaluationConfig(changed, 1, method="modes"))
@@ -155,29 +151,23 @@ def test_auto_plays_the_scene_where_it_is_at_hand(
     assert registrar.states_or_none is few_rope_states
 
 
-def test_without_its_mesh_auto_fits_the_modes_and_full_says_what_is_missing(
-    model: Model, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_its_mesh_the_modes_are_fitted(model: Model, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(register, "load_scene", Mock(side_effect=AssetUnavailable("the mesh is not here")))
     assert Registrar.of(model).states_or_none is None
-    with pytest.raises(AssetUnavailable, match="the mesh is not here"):
-        Registrar.of(model, "full")
 
 
-def test_a_refused_registration_leaves_the_answer_to_the_network(model: Model, view: SampleView) -> None:
+def test_a_registration_that_explains_too_little_is_the_answer_and_not_known(model: Model, view: SampleView) -> None:
     stretched = view.depth.to_points().points * np.array([1.0, 2.5, 1.0])
     without_scene = replace(model, provenance={"scene": "mine"})
     found = answer_to(stretched, model, Registrar.of(without_scene), 32)
-    assert found.registration is not None and not found.registration.accepted and not found.taken
-    forced = answer_to(stretched, model, Registrar.of(model, "modes"), 32)
-    assert forced.taken and forced.registration is not None and not forced.registration.accepted
+    assert found.registration is not None and not found.registration.accepted and found.recognition.known is not True
+    assert found.surfaces is found.registered.mesh
 
 
-def test_where_no_registration_is_found_auto_says_why(model: Model, view: SampleView) -> None:
+def test_where_no_fit_can_start_it_says_why_with_weights_too(model: Model, view: SampleView) -> None:
     cloud = PointCloud(view.depth.to_points().points / 1000.0)
-    found = answer_to(cloud, model, Registrar.of(model), 32, scene_unit=1.0)
-    assert not found.taken and found.registration is None and "correct the unit of the frame" in str(found.refusal)
-    assert found.recognition.known is False and len(found.surfaces.segments) == len(model.names)
+    with pytest.raises(NoFit, match="correct the unit of the frame"):
+        answer_to(cloud, model, Registrar.of(model), 32, scene_unit=1.0)
 
 
 MOTION = "the pose is .* must be 4 x 4 finite numbers: a rotation and a translation"

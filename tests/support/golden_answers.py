@@ -118,7 +118,7 @@ def facts_of(name: str, frame: Frame) -> JsonObject:
     assert model is not None
     scores = intersection_over_union(grid_confusion(grid, labels, len(model.names)), model.segmented)
     facts = {
-        "answer": "network" if not found.taken or registration is None else registration.method,
+        "answer": "network" if registration is None else registration.method,
         "iou": round(scores.iou, 4),
         "miou": round(scores.miou, 4),
         "known": found.recognition.known,

@@ -68,7 +68,7 @@ def test_figures_are_in_millimetres_where_the_unit_is_known(
 
 def test_the_page_counts_the_points_once_and_has_no_words_of_programs(tmp_path: Path) -> None:
     cloud, mesh, summary = example()
-    told = {"answer": "registration", "explained": 0.973}
+    told = {"explained": 0.973}
     said = {"recognition": {"known": "unsure", "reason": "a part is bent: look at it", "signs": {"size": 0.1}}}
     Report(cloud, mesh, {**summary, **said, "registration": told}).write(tmp_path / "r.html")
     data = page_data(tmp_path / "r.html")
@@ -196,12 +196,8 @@ def test_places_and_volumes_are_told_as_exactly_as_they_are_known() -> None:
     assert Unit(None).volume(0.0190072, (0.0189981, 0.0190163)) == "0.01901 (0.01900 to 0.01902)"
 
 
-TAKEN = {"answer": "registration", "explained": 0.989, "accepted": True}
-KEPT = {"answer": "network", "explained": 0.668, "accepted": False}
-FLAT = {"answer": "network", "refusal": "the cloud is flat"}
+FIT = {"explained": 0.989, "accepted": True}
 NOTHING = "Network alone: nothing says whether this is the object."
-LITTLE = "Doubtful: the model explains only 66.8 % of the points, so this is"
-UNCHECKED = "Not checked: nothing says whether this is the object; the model explains 98.9"
 
 
 def recognized(known: bool | str, reason: str | None = None) -> Recognition:
@@ -211,17 +207,13 @@ def recognized(known: bool | str, reason: str | None = None) -> Recognition:
 @pytest.mark.parametrize(
     "recognition, registration, level, line, cure",
     [
-        (recognized(True), TAKEN, "yes", "Trust it: the frame shows the object; the model explains 98.9 %", None),
-        (recognized("unsure", "3% are not: look, or crop"), TAKEN, "doubt", "Doubtful: 3% are not.", "look, or crop"),
-        (recognized(False, "size: unit (-u: m)"), TAKEN, "no", "Do not trust it: size.", "unit (-u: m)"),
-        (recognized(False, "off: look"), KEPT, "no", "Do not trust it: off; the model explains only 66.8 %", "look"),
-        (recognized(False, "only 3% of the points: turn"), KEPT, "no", "Do not trust it: only 3% of the p", "turn"),
-        (Recognition(False, "the cloud is flat", MOST), FLAT, "no", "Do not trust it: the cloud is flat.", None),
-        (recognized(True), KEPT, "doubt", LITTLE, None),
-        (recognized(True), {**TAKEN, "explained": 0.7, "accepted": False}, "doubt", "Doubtful: the model ex", None),
+        (recognized(True), FIT, "yes", "Trust it: the frame shows the object; the model explains 98.9 %", None),
+        (recognized("unsure", "3% are not: look, or crop"), FIT, "doubt", "Doubtful: 3% are not.", "look, or crop"),
+        (recognized(False, "size: unit (-u: m)"), FIT, "no", "Do not trust it: size.", "unit (-u: m)"),
+        (recognized(False), FIT, "no", "Do not trust it: it was not recognized.", None),
+        (Recognition(False, "the object is lost", MOST), None, "no", "Do not trust it: the object is lost.", None),
         (NOT_EVALUATED, None, "alone", NOTHING, None),
         (None, None, "alone", NOTHING, None),
-        (None, TAKEN, "unchecked", UNCHECKED, None),
     ],
 )
 def test_a_verdict_is_one_line_with_its_reason(
@@ -233,23 +225,19 @@ def test_a_verdict_is_one_line_with_its_reason(
     assert (found.level, found.cure) == (level, cure) and verdict.startswith(line)
 
 
-@pytest.mark.parametrize("is_accepted", [True, False])
-@pytest.mark.parametrize("answer", ["registration", "network"])
+@pytest.mark.parametrize("fit", [FIT, None])
 @pytest.mark.parametrize("known", [True, "unsure", False])
-def test_report_summary_and_exit_status_say_the_same(known: bool | str, answer: str, is_accepted: bool) -> None:
-    """Only what is known, explained, and the model's own answer can be relied on without looking."""
-    for signs in (Signs(size=0.01, unexplained=0.2), None):
-        recognition = Recognition(known, None if known is True else "it is bent: look", 5.0, signs)  # type: ignore[arg-type]
-        fit = {"answer": answer, "explained": 0.9, "accepted": is_accepted}
-        summary = {"recognition": recognition.facts(), "registration": fit}
-        level, word, _ = page_words(summary, Unit(None))["trust"]
-        verdict = trust(summary)
-        assert (level, word) == (verdict.level, f"{VERDICTS[verdict.level]}:")
-        is_sure = known is True and is_accepted and answer == "registration"
-        expected = ("Trust it", 0) if is_sure else ("Do not trust it", 3) if known is False else ("Doubtful", 4)
-        if known == "unsure" and signs is None:
-            expected = ("Not checked" if answer == "registration" else "Network alone", 4)
-        assert (VERDICTS[verdict.level], verdict.status) == expected
+def test_report_summary_and_exit_status_say_the_same(known: bool | str, fit: JsonObject | None) -> None:
+    """Only what is known and the model's own answer can be relied on without looking."""
+    signs = None if fit is None else Signs(size=0.01, unexplained=0.2)
+    recognition = Recognition(known, None if known is True else "it is bent: look", 5.0, signs)  # type: ignore[arg-type]
+    summary = {"recognition": recognition.facts(), "registration": fit}
+    level, word, _ = page_words(summary, Unit(None))["trust"]
+    verdict = trust(summary)
+    assert (level, word) == (verdict.level, f"{VERDICTS[verdict.level]}:")
+    unsure = ("Network alone" if fit is None else "Doubtful", 4)
+    expected = {True: unsure if fit is None else ("Trust it", 0), "unsure": unsure, False: ("Do not trust it", 3)}
+    assert (VERDICTS[verdict.level], verdict.status) == expected[known]
 
 
 @pytest.mark.parametrize("junk", [None, 3, [], {"known": None, "explained": float("nan"), "answer": 7}])

@@ -118,7 +118,7 @@ class Object:
         if self.network is not None:
             return registrar_for(self.network, method, self.scene)
         assert self.model is not None
-        return Registrar(None, self.model, method, self.scene).checked()
+        return Registrar(None, self.model, method, self.scene)
 
     def with_deformation_model(self) -> "Object":
         """The same with a statistical model; weights that carry none get that of their built-in scene, in seconds.

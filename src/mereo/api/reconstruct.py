@@ -219,9 +219,9 @@ def reconstruct(
         frame: whatever ``load_frame`` takes, or what it has returned; a list of frames is answered as a list. In a
             whole depth image, which plainly shows more than an object of this size, the object is looked for.
         object: from ``load_object``, or whatever that takes.
-        method: "auto" takes the registered model where it explains the frame, else the network's surfaces; "network"
-            leaves the network alone; "search" leaves it out; "modes" and "full" take the registered model in any case,
-            "full" by fitting the parameters of its scene as well. Without weights, "auto" is "search".
+        method: "auto" registers the model by a search that begins at a network's guess, where there are weights;
+            "search" leaves the network out; "network" takes its surfaces alone; "modes" leaves the parameters of the
+            object's scene out.
         resolution: cells along the longest side of the object's box.
         isolation: what of the frame is left out, or a dict of its fields; lengths in metres, or in the frame's unit
             where that is not known.
@@ -240,8 +240,7 @@ def reconstruct(
 
     Warns with ``SizeWarning`` where the visible part cannot be the object of the weights, and without weights with
     ``ClustersWarning`` where the cloud may be two objects. Raises ``ValueError`` for unusable frames,
-    where nothing is found, and for methods other than "auto" where the model cannot be registered; ``TypeError`` for an
-    option that there is none of.
+    and where no fit can start; ``TypeError`` for an option that there is none of.
     """
     results = list[Result]()
     are_many = is_frame_list(frame) or (
@@ -297,8 +296,6 @@ def reconstruct_observation(
         label_points=label_points,
         instances=instances,
     )
-    if answer.error is not None and method != "auto":
-        raise answer.error
     result = Result.of(answer)
     _ = result.reconstruction  # raises where nothing is found
     if object.network is not None:
@@ -321,9 +318,8 @@ class Tracker:
       again by a search in the background.
     - "followed": the last frame's state led to it.
     - "lost": the object has left the view, is covered, or has moved too far; ``known`` is False and
-      ``recognition.reason`` says why. No registration is the answer: ``surfaces`` raise ``ValueError``, but those of
-      the first frame are a network's, where there are weights. A search goes on in a thread of its own, while frames
-      are answered in milliseconds, until the object is found.
+      ``recognition.reason`` says why; ``surfaces`` raise ``ValueError``. A search goes on in a thread of its own,
+      while frames are answered in milliseconds, until the object is found.
 
     ``close``, or leaving a ``with`` block, ends that thread.
     """
@@ -343,7 +339,7 @@ class Tracker:
 
         Args:
             object: from ``load_object``, or whatever that takes.
-            method: "auto", or "modes" to take the registered model even where it does not explain the frame.
+            method: "auto", or "search" to leave out the network.
             executor: what searches for a lost object; by default a thread of the tracker's own.
             isolation: what of each frame is left out, as in ``reconstruct``.
             initial_pose: rough pose of the object in the first frame, as in ``reconstruct``.
@@ -356,7 +352,7 @@ class Tracker:
         self._initial_pose = None if initial_pose is None else checked_pose(initial_pose)
         known = object_of(object, joints)
         registrar, self._scene = None if method == "network" else known.registrar(method), known.scene
-        if registrar is None or method == "full":
+        if registrar is None:
             raise ValueError(
                 f'the method is {method!r}, and only the modes of a deformation model can be followed: take "auto" '
                 "with weights that carry one"

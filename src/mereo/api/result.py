@@ -599,8 +599,7 @@ DRAWN = (".html", ".png")
 """Suffixes of files that show the observed points."""
 
 NO_REGISTRATION = (
-    "the network's answer is kept, but --carry needs a registration, along which things move: leave out of the "
-    "cloud what is not the object, or take the registered model in any case with --method modes"
+    "the network alone answers, and --carry needs a registration, along which things move: take it with --method auto"
 )
 
 

@@ -44,9 +44,9 @@ class ReconstructCommand(FrameOptions):
             created.
         resolution: grid cells along the longest side.
         files: which files, and in which unit.
-        method: register the object's own deformation model to the frame: auto takes the registered model where it
-            explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
-            modes and full take the model in any case, full by fitting the draws of the scene as well.
+        method: auto registers the object's model by a search that begins at a network's guess, if there are weights;
+            search leaves the network out; network takes its surfaces alone; modes leaves the parameters of the scene
+            out.
         scene: the scene's name or file, whose draws are fitted, where it is not the built-in one of the weights.
         initial_pose: file of the object's rough pose, from which the fit starts instead of a search or a network: 4 x 4
             numbers (text, NPY, or the summary.json of a result) that take the object's own files, in the frame's unit,
@@ -156,8 +156,8 @@ class StreamCommand(FrameOptions):
         joints: file of joints whose values are known and stay as they are, as for `mereo reconstruct`; or a folder of
             such files, one for each frame, 0000.yaml for 0000.png; or a ROS recording's topic of JointState.
         resolution: grid cells along the longest side of the network's surfaces: fewer are faster.
-        method: auto follows the registered model where it explains the frame, if the weights carry one, and else asks
-            the network; network uses it alone, frame by frame; search leaves it out; modes takes the model in any case.
+        method: auto follows the registered model, which a search finds from a network's guess, if there are weights;
+            search leaves the network out; network uses it alone, frame by frame.
         radius: say how sure the registered model is of the object's surface, which takes some 30 ms.
         uncertainty: say how sure the registered model is of each segment, too: the radius, in the input's unit, that
             holds the true place of its centroid with probability 0.95, and the interval of its volume.
@@ -197,9 +197,9 @@ class ServeCommand:
         weights: a shipped name or a file, once for each object that has them; NAME=FILE says what clients call it.
         scene: NAME=FILE of the scene whose draws are fitted, where it is not the built-in one of the weights; once for
             each.
-        method: register the object's own deformation model to the frames: auto takes the registered model where it
-            explains the frame, if the weights carry one; network leaves the network's answer, search the network out;
-            modes and full take the model in any case, full by fitting the draws of the scene as well.
+        method: auto registers the object's model by a search that begins at a network's guess, if there are weights;
+            search leaves the network out; network takes its surfaces alone; modes leaves the parameters of the scene
+            out.
         port: where it listens; 0 takes any that is free.
         host: address of this machine. Only this machine reaches the default. Another one needs the token of the address
             that is printed, and others on the network can read along: a proxy that encrypts is safer.

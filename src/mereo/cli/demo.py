@@ -64,7 +64,7 @@ class Demo:
                 seconds = perf_counter() - started
                 result.save(folder, overwrite=True)
             scores[name] = {"output": str(folder), **_print_scores(title, result, truth), "seconds": seconds}
-            page = f", or in the browser: mereo view {folder}" if result.taken else ""
+            page = f", or in the browser: mereo view {folder}" if result.pose is not None else ""
             print(f"{len(frame.cloud)} points, {seconds:.1f} s; look at {folder / 'report.html'}{page}\n")
         if not has_network():
             print(

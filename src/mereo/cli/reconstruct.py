@@ -314,7 +314,7 @@ def _print_table(frames: Sequence[tuple[Path, Path]], summaries: Mapping[Path, S
         fit, segments = summary.get("registration", {}), summary["segments"]
         table.add_row(
             file.name,
-            "registered model" if fit.get("answer") == "registration" else "network",
+            "registered model" if fit else "network",
             f"{fit['explained']:.1%}" if "explained" in fit else "",
             {"yes": "yes", "no": "no"}.get(trust(summary).level, "unsure"),
             f"{sum(segment['voxels'] > 0 for segment in segments)} of {len(segments)}",
@@ -428,15 +428,12 @@ def print_source(answer: Answer) -> None:
     """Print where an answer comes from, and whether it can be believed."""
     registration = answer.registration
     if registration is None:
-        print(f"the network's answer, as no registration was found: {answer.refusal}")
         return
     ways = {"search": "; found by search", "pose": "; from the initial pose"}
-    by = ways.get(answer.located_by, "") if answer.taken else ""
-    explained = f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}{by})"
-    print(explained if answer.taken else f"{explained}: too little, the network's answer is kept")
-    if answer.taken and not registration.accepted:
-        cure = "look at the result" if answer.model is None else "--method auto keeps the network's answer"
-        print(f"that is too little to believe it: {cure}")
+    by = ways.get(answer.located_by, "")
+    print(f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}{by})")
+    if not registration.accepted:
+        print("that is too little to believe it: look at the result")
     if answer.recognition.description is not None:
         print(answer.recognition.description)
     model = registration.model

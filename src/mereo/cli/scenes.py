@@ -133,7 +133,7 @@ class SceneModes:
         count = model.modes_for(ENOUGH)
         print(
             f"even all modes leave {model.residue:.3f} units, more than {ENOUGH}, the noise of the paper's sensor: the "
-            "states lie on a curved set, so the scene's own draws fit better (--method full)"
+            "states lie on a curved set, so the scene's own draws fit better"
             if count is None
             else f"{count} modes leave at most {ENOUGH} units, the noise of the paper's sensor"
         )

@@ -474,7 +474,7 @@ class FrameAnswer:
     """Answer to a frame of a stream, in the input's frame and units.
 
     Attributes:
-        surfaces: of all segments; None where the object is lost and no network answers.
+        surfaces: of all segments; None where the object is lost.
         facts: what is printed: who answers (``method``), how it was tracked, the share of points that the registered
             model explains, whether the frame shows the object, ``pose`` and ``joints`` as of ``Result``, points that
             were dropped, and each segment's ``centroid`` and ``volume``, with its ``pose`` where the registered model
@@ -492,7 +492,7 @@ class FrameAnswer:
             "method": None if is_missing else "network",
             "tracked": answer.tracked,
             "tracking": answer.tracking,
-            "explained": None if registration is None or is_missing else round(registration.explained, 4),
+            "explained": None if registration is None else round(registration.explained, 4),
             "known": answer.recognition.known,
             "reason": answer.recognition.reason,
             "pose": None,

@@ -3,9 +3,9 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
-AnswerMethod = Literal["auto", "network", "search", "modes", "full"]
-"""Source of the answer to a frame: the registered model where that explains the frame, else the network; the network
-alone; the registered model in any case, the same, or by its modes alone, or by the draws of its scene in any case."""
+AnswerMethod = Literal["auto", "network", "search", "modes"]
+"""Source of the answer to a frame: the registered model, found from a network's guess where there is one; the network
+alone; the registered model without a network; or by its modes alone, without the draws of its scene."""
 
 LocatedBy = Literal["search", "network", "pose"]
 """What located the object in a frame: a search over poses and states, a trained network, whose answer then it is, or a
@@ -119,7 +119,7 @@ MANY_DRAWS = DrawsConfig(
 FEW_DRAWS = 30
 
 
-StreamMethod = Literal["auto", "network", "search", "modes"]
+StreamMethod = Literal["auto", "network", "search"]
 """Source of the answers to a sequence, as ``AnswerMethod``; draws take longer than the time between two frames."""
 
 

@@ -38,7 +38,6 @@ from mereo.io.cores import limit_blas_threads
 from mereo.models.calibration import Calibration
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.scenes.parameters import known_distances
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import PairDistances, StatisticalModel
@@ -268,7 +267,7 @@ class SynchronousExecutor(Executor):
         return future
 
 
-Search = Callable[[Observation, Registrar, bool, float | None], tuple[Candidate, Any]]
+Search = Callable[[Observation, Registrar, bool, float | None], Candidate]
 """What finds the object in a frame, as ``search_hypotheses`` does."""
 
 
@@ -294,7 +293,7 @@ class BackgroundSearch:
         if self._running is None:
             executor = self._thread if self.executor is None else self.executor
             search, options = self.search or search_hypotheses, (frame.keep_all, frame.scene_unit)
-            searched = executor.submit(lambda: search(frame.seen, self.registrar.narrowed(frame.scene), *options)[0])
+            searched = executor.submit(lambda: search(frame.seen, self.registrar.narrowed(frame.scene), *options))
             self._running = frame, searched
 
     def take(self) -> tuple[TrackedFrame, Candidate] | None:
@@ -387,25 +386,22 @@ class Tracker:
             keep_all: take every point for the object's.
             scene: the object's with the joints that are known in this frame (``with_joints``); None without any.
 
-        The first frame is waited for, however long a search takes. Raises ``ValueError`` where that is unusable or,
-        unless a network can answer, shows too little; of later frames the object is then lost, and the track is kept.
+        The first frame is waited for, however long a search takes. Raises ``ValueError`` where that is unusable or
+        shows too little; of later frames the object is then lost, and the track is kept.
         """
         started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all, scene)
         tracked, why = self._tracked(self._track, frame, self.config.longest_s)
         if tracked is not None and not self._doubt(tracked):
             return self._gone_on(frame, tracked, started)
-        alone = None
-        if not self._has_begun:
-            alone = self._by_itself(frame, started)
-            if alone.tracking != "lost":
-                return alone
+        if not self._has_begun and (alone := self._by_itself(frame, started)) is not None:
+            return alone
         again = self._searched(frame)
         if again is None:
             self._search.start(frame)
             again = self._searched(frame)  # some executors have done it now
         if again is not None:
             return self._gone_on(frame, again, started, "found")
-        return self._lost(frame, alone, why if tracked is None else self._doubt(tracked), started)
+        return self._lost(frame, why if tracked is None else self._doubt(tracked), started)
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> "tuple[_Tracked | None, str]":
         """Fit the frame from an earlier state; None, and why, without one that leads to it."""
@@ -450,27 +446,23 @@ class Tracker:
         self._T_camera_input, self._axes = before
         return None
 
-    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate, EncodedFrame]:
-        """What of a frame is taken for the object, its best candidate, and what ``find`` returns besides."""
-        return frame.seen, *find(frame.seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
+    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
+        """What of a frame is taken for the object, and its best candidate."""
+        return frame.seen, find(frame.seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
 
-    def _by_itself(self, frame: TrackedFrame, started: float) -> Answer:
-        """Answer a frame by itself, which begins a track; the object is lost where nothing explains it."""
+    def _by_itself(self, frame: TrackedFrame, started: float) -> Answer | None:
+        """Answer a frame by itself, which begins a track; None where nothing explains it."""
         registrar, config = self.registrar.narrowed(frame.scene), self.config
-        seen, candidate, likelier = self._locate(frame, registrar)
-        must_register = registrar.method != "auto" or registrar.network is None
-        if candidate.error is not None and must_register:
-            raise candidate.error
-        self._has_begun, alone = True, None
-        if candidate.modes is not None:
-            alone = _Tracked.of_frame(candidate, frame.time_s, config, self.registrar)
-        if alone is None or self._doubt(alone):
-            registration = None if alone is None else alone.fitted.registration
-            answer = answer_of(seen, registrar.network, None, candidate, likelier, registration)
-            return replace(answer, registrar=registrar, tracking="lost")
+        seen, candidate = self._locate(frame, registrar)
+        self._has_begun = True
+        if candidate.modes is None:
+            return None
+        alone = _Tracked.of_frame(candidate, frame.time_s, config, self.registrar)
+        if self._doubt(alone):
+            return None
         self._track, self._located_by = alone.track, candidate.located_by
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, seen.frame.axes
-        answer = answer_of(seen, registrar.network, registrar, candidate, likelier, alone.fitted.registration)
+        answer = answer_of(seen, registrar.network, registrar, candidate, alone.fitted.registration)
         return replace(answer, seconds=time.perf_counter() - started)
 
     def _doubt(self, tracked: "_Tracked") -> str:
@@ -505,21 +497,26 @@ class Tracker:
             hypothesis=tracked.hypothesis,
             T_camera_input=self._T_camera_input,
             registration=tracked.fitted.registration,
-            taken=True,
             recognition=recognition,
             located_by=self._located_by,
             tracking=tracking,
             seconds=time.perf_counter() - started,
         )
 
-    def _lost(self, frame: TrackedFrame, alone: Answer | None, why: str, started: float) -> Answer:
-        """Answer a frame in which the object is lost: by the network alone, or by nothing."""
+    def _lost(self, frame: TrackedFrame, why: str, started: float) -> Answer:
+        """Answer a frame in which the object is lost, without surfaces."""
         reason = f"the object is lost: {why}; it is being searched for, so keep it in view, or start again with it"
-        if alone is None or alone.model is None:
-            hypothesis = Reading.of_all(frame.seen.cloud)
-            alone = Answer(frame.seen, None, self.registrar, hypothesis, self._T_camera_input, located_by="search")
-        recognition = Recognition(False, reason, MOST, has_weights=alone.model is not None)
-        return replace(alone, recognition=recognition, tracking="lost", seconds=time.perf_counter() - started)
+        return Answer(
+            seen=frame.seen,
+            model=None,
+            registrar=self.registrar,
+            hypothesis=Reading.of_all(frame.seen.cloud),
+            T_camera_input=self._T_camera_input,
+            recognition=Recognition(False, reason, MOST, has_weights=self.registrar.network is not None),
+            located_by="search",
+            tracking="lost",
+            seconds=time.perf_counter() - started,
+        )
 
 
 @dataclass(frozen=True, eq=False)

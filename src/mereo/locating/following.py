@@ -15,17 +15,13 @@ from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import Track, TrackedFrame
 from mereo.locating.whole_frame import NEAR, at_point, is_whole, locate_object, part_of, pixels_near
 from mereo.reconstruction.observation import Observation
-from mereo.reconstruction.pipeline import EncodedFrame
 from mereo.scenes.scene import Scene
 
 
-def search_frame(
-    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
-) -> tuple[Candidate, Any]:
+def search_frame(seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None) -> Candidate:
     """Search the object, as ``search_hypotheses``, where a whole frame has it."""
     if is_whole(seen, registrar):
-        _, candidate = locate_object(seen, registrar, keep_all, scene_unit)
-        return candidate, candidate.encoded
+        return locate_object(seen, registrar, keep_all, scene_unit)[1]
     return search_hypotheses(seen, registrar, keep_all, scene_unit)
 
 
@@ -54,11 +50,10 @@ class Tracker(tracking.Tracker):
         seen = replace(seen, point=None) if self._has_begun else at_point(seen, self.registrar)
         return super().follow(seen, time_s, scene_unit=scene_unit, keep_all=keep_all, scene=scene)
 
-    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate, EncodedFrame]:
+    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
         if not is_whole(frame.seen, registrar):
             return super()._locate(frame, registrar)
-        seen, candidate = locate_object(frame.seen, registrar, frame.keep_all, frame.scene_unit)
-        return seen, candidate, candidate.encoded
+        return locate_object(frame.seen, registrar, frame.keep_all, frame.scene_unit)
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:
         whole = frame.seen.frame.whole

@@ -245,10 +245,12 @@ class WholeFrame:
             candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds, matches)
         except ValueError:
             return None
-        if candidate.modes is None or not self.is_at_point(self.explained(candidate.modes.registration.mesh)):
+        assert candidate.modes is not None
+        registration = candidate.modes.registration
+        if not self.is_at_point(self.explained(registration.mesh)):
             return None
-        answer = answer_of(seen, model, registrar, candidate, encoded, candidate.modes.registration)
-        return PlacedAnswer(place, seen, candidate, answer, self.outline(candidate.modes.registration.mesh))
+        answer = answer_of(seen, model, registrar, candidate, registration)
+        return PlacedAnswer(place, seen, candidate, answer, self.outline(registration.mesh))
 
     def finished(self, placed: "PlacedAnswer", keep_all: bool) -> "PlacedAnswer":
         """The same where it may be the object: by pixels that are chosen once more, and with the scene's parameters."""
@@ -257,7 +259,7 @@ class WholeFrame:
             return placed
         again = self.answered(self.place(placed.place.mask, [modes.posed]), model, keep_all, ())
         best = placed if again is None else max(placed, again, key=lambda each: each.score)
-        answer = answer_candidate(best.seen, model, self.registrar, best.candidate, best.candidate.encoded)
+        answer = answer_candidate(best.seen, model, self.registrar, best.candidate)
         assert answer.registration is not None
         return replace(best, answer=answer, outline=self.outline(answer.registration.mesh), is_finished=True)
 

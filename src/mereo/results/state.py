@@ -217,7 +217,7 @@ def state_of(
 def write_state(directory: Path, answer: Answer) -> None:
     """Write the state of an answer into a folder of results, where the answer is a registered model."""
     registrar = answer.registrar
-    if registrar is None or answer.registration is None or not answer.taken:
+    if registrar is None or answer.registration is None:
         return
     known = registrar.given.name if registrar.given is not None else registrar.trained_scene
     scene = registrar.scene if answer.registration.method == "draws" else None

@@ -207,13 +207,12 @@ def _same(rows: Int[ndarray, "n 3"]) -> tuple[Subset, Indices]:
 
 # --- trust ------------------------------------------------------------------------------------------------------------
 
-Level = Literal["yes", "doubt", "no", "unchecked", "alone"]
+Level = Literal["yes", "doubt", "no", "alone"]
 
 VERDICTS: Mapping[Level, str] = {
     "yes": "Trust it",
     "doubt": "Doubtful",
     "no": "Do not trust it",
-    "unchecked": "Not checked",
     "alone": "Network alone",
 }
 """First words of the line."""
@@ -227,8 +226,7 @@ class Trust:
     """Verdict on an answer.
 
     Attributes:
-        level: how far it can be trusted; "alone" where no model was registered, which could tell, and "unchecked" where
-            one was, but nobody looked.
+        level: how far it can be trusted; "alone" where no model was registered, which could tell.
         why: a phrase, without a full stop.
         cure: what to do, a phrase; None where nothing is to be done, or nothing known.
     """
@@ -249,24 +247,17 @@ def trust(summary: Facts) -> Trust:
     Args:
         summary: its ``recognition`` and ``registration`` are read.
     """
-    recognition, registration = _block(summary, "recognition"), _block(summary, "registration")
-    known, reason = recognition.get("known"), recognition.get("reason") or registration.get("refusal")
-    number = _number(registration.get("explained"))
-    explained = None if number is None else f"{100 * number:.1f}\N{NO-BREAK SPACE}% of the points"
-    model_explains = "" if explained is None else f"; the model explains {explained}"
-    is_model = registration.get("answer") == "registration"
-    if not isinstance(known, bool) and not recognition.get("signs") and not registration.get("refusal"):
-        return Trust("unchecked" if is_model else "alone", f"nothing says whether this is the object{model_explains}")
-    if known is not True:
-        # a reason is what was seen, a colon, and what to do about it
-        why, _, cure = str(reason or "it was not recognized").removesuffix(".").partition(": ")
-        if explained is not None and not is_model and "of the points" not in why:
-            why = f"{why}; the model explains only {explained}"
-        return Trust("doubt" if known == "unsure" else "no", why, cure or None)
-    if not is_model or registration.get("accepted") is False:
-        why = "the model explains too little" if explained is None else f"the model explains only {explained}"
-        return Trust("doubt", why if is_model else f"{why}, so this is the network's answer")
-    return Trust("yes", f"the frame shows the object{model_explains}")
+    recognition = _block(summary, "recognition")
+    known, explained = recognition.get("known"), _number(_block(summary, "registration").get("explained"))
+    if known is True and explained is not None:
+        share = f"{100 * explained:.1f}\N{NO-BREAK SPACE}% of the points"
+        return Trust("yes", f"the frame shows the object; the model explains {share}")
+    if known is not False and not recognition.get("signs"):
+        return Trust("alone", "nothing says whether this is the object")
+    # a reason is what was seen, a colon, and what to do about it
+    reason = str(recognition.get("reason") or "it was not recognized")
+    why, _, cure = reason.removesuffix(".").partition(": ")
+    return Trust("no" if known is False else "doubt", why, cure or None)
 
 
 def _block(summary: Facts, key: str) -> Facts:
@@ -387,12 +378,12 @@ def radius_words(radius95: Facts, unit: Unit) -> str:
 
 def _answer(registration: Facts, verdict: Trust) -> str:
     explained = _number(registration.get("explained"))
-    if registration.get("answer") != "registration":
+    if explained is None:
         return "the network's own answer"
     ways = {"search": "found by a search", "pose": "fitted from the initial pose"}
     how = ways.get(str(registration.get("located_by")), "registered")
-    # two of the verdicts say themselves how much it explains
-    share = "" if explained is None or verdict.level in ("yes", "unchecked") else f"{explained:.1%}"
+    # a good verdict says itself how much it explains
+    share = "" if verdict.level == "yes" else f"{explained:.1%}"
     return f"your model, {how}" + (share and f": it explains {share} of the points")
 
 

@@ -59,10 +59,8 @@ def summary_of(
         # of what the file states and of the segments at rest
         digest = hashlib.sha256((rest_digest(scene.rest) + scene.definition).encode()).hexdigest()
         facts["scene_file"] = {"path": str(scene.file), "sha256": digest}
-    if registrar is not None:
-        kind = "registration" if answer.taken else None if answer.is_missing else "network"
-        source, fit = {"answer": kind, "located_by": answer.located_by}, answer.registration
-        facts["registration"] = source | ({"refusal": answer.refusal} if fit is None else describe(fit))
+    if answer.registration is not None:
+        facts["registration"] = {"located_by": answer.located_by, **describe(answer.registration)}
     axes = frame.axes if frame.T_result_seen is None else "other"
     # the first mention of a key is its place; what it is comes from the facts
     head = {"title": None, "verdict": trust(facts).level, "recognition": None, "frame": axes, "unit_m": None}

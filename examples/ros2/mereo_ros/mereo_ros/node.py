@@ -33,7 +33,7 @@ PARAMETERS: dict[str, tuple[Any, str]] = {
     "weights": ("", "weights of the object, a name or a file; without them a search finds it"),
     "units": ("", "unit of the meshes: m, cm, mm or in; guessed where empty"),
     "deformations": ("auto", "how an object of meshes moves: rigid, soft, stiff, articulated, or auto"),
-    "method": ("auto", "auto, or modes to take the registered model even where it does not explain the frame"),
+    "method": ("auto", "auto, or search to leave out the network"),
     "input": ("depth", "depth for an image and its camera_info, points for a cloud in an optical frame"),
     "rectified": (True, "the depth image is rectified, so that its intrinsics are the matrix P, and not K"),
     "object_frame": ("object", "frame of the object's files, in metres; its segments are below it"),

@@ -43,12 +43,11 @@ class Candidate:
 
     Attributes:
         encoded: these points, in the camera frame.
-        modes: the fit; None where none was wanted, or none was found for ``error``.
+        modes: the fit; None where none was wanted, or where something else is likelier.
     """
 
     encoded: EncodedFrame
     modes: ModesFit | None = None
-    error: ValueError | None = None
     located_by: LocatedBy = "search"
 
     @property
@@ -107,7 +106,6 @@ class Answer:
         T_camera_input: from the frame's axes to the camera frame.
         candidate: the fit to the frame by itself; None where the last frame's state led to the answer.
         registration: of the deformation model, in the camera frame and the frame's unit; None without one.
-        taken: whether the answer is the registered model; otherwise it is the network's.
         recognition: whether the frame shows the object, in a state that was learned; whoever answers.
         resolution: cells along the longest side of the object's box in ``reconstruction``.
         label_points: whether ``reconstruction`` also labels the observed points by segment.
@@ -124,7 +122,6 @@ class Answer:
     T_camera_input: Float[np.ndarray, "4 4"]
     candidate: Candidate | None = None
     registration: Registration | None = None
-    taken: bool = False
     recognition: Recognition = NOT_EVALUATED
     resolution: int = 128
     label_points: bool = False
@@ -137,54 +134,40 @@ class Answer:
         return f"{type(self).__name__}({self.seen.frame.source!r}: {self.source})"
 
     @property
-    def error(self) -> ValueError | None:
-        """Error of the registration, where one was wanted and none was found."""
-        return None if self.candidate is None else self.candidate.error
-
-    @property
-    def refusal(self) -> str | None:
-        """Message of ``error``."""
-        return None if self.error is None else str(self.error)
-
-    @property
     def tracked(self) -> bool:
         """Whether the last frame's state led to the answer, without the network."""
         return self.tracking == "followed"
 
     @property
     def is_missing(self) -> bool:
-        """Whether there are no surfaces: the object is lost, and no network answers."""
-        return self.tracking == "lost" and self.model is None
+        """Whether there are no surfaces: the object is lost."""
+        return self.tracking == "lost"
 
     @property
     def source(self) -> str:
         """Where the answer comes from, in a phrase."""
         if self.is_missing:
             return "lost"
-        if self.registration is None:
-            return "network alone" if self.refusal is None else f"network alone: {self.refusal}"
-        phrase = self.registration.description
-        return phrase if self.taken else f"network alone: the {phrase}, too few"
+        return "network alone" if self.registration is None else self.registration.description
 
     @cached_property
     def registered(self) -> Registration | None:
-        """Registration in the frame's own axes, where it is the answer; else None."""
-        if self.registration is None or not self.taken:
-            return None
-        return self.registration.moved(inverse_rigid(self.T_camera_input))
+        """Registration in the frame's own axes; None where the network alone answers, and of a lost object."""
+        registration = self.registration
+        return None if registration is None else registration.moved(inverse_rigid(self.T_camera_input))
 
     @cached_property
     def reconstruction(self) -> Reconstruction:
         """Surfaces, label grid and figures of all segments, in the frame's axes and unit.
 
-        Raises ``ValueError`` where the network answers and finds no segment, and where a lost object has no network.
+        Raises ``ValueError`` where the network alone answers and finds no segment, and of a lost object.
         """
         if self.is_missing:
             raise ValueError(self.recognition.reason)
         with stage("extract surfaces and labels"):
-            if self.taken and self.registration is not None:
+            if self.registration is not None:
                 return self._registered_reconstruction(self.registration)
-            assert self.model is not None  # else the registration is taken
+            assert self.model is not None
             return extract(self.encoded, self.model, self.resolution, self.label_points)
 
     def _registered_reconstruction(self, registration: Registration) -> Reconstruction:

@@ -7,6 +7,7 @@ Observation -find-> Candidate (by a search, or from a given pose) -fit draws-> R
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import reduce
 
 import numpy as np
 from jaxtyping import Float
@@ -27,6 +28,7 @@ from mereo.io.bounds import Cells, PositiveOrUnknown, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.trained import Trained
+from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation, main_length
 from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
 from mereo.scenes.statistical_model import StatisticalModel
@@ -47,42 +49,38 @@ def answer_frame(
     Args:
         seen: the object in the frame, outliers among its points.
         model: the weights; None of an object without.
-        registrar: of the same object, set up once for many frames; None leaves the network alone. With "auto" a
-            registration that does not explain the frame leaves the answer to the network, with other choices, and
-            without a network, it is taken all the same.
+        registrar: of the same object, set up once for many frames; None leaves the network alone.
         keep_all: take every point for the object's.
         scene_unit: length of a scene unit in the frame's unit, where it is known for certain. Otherwise it follows
             from the frame's unit, or is found together with the pose.
         resolution: cells along the longest side of the object's box in ``Answer.reconstruction``.
         label_points: let ``Answer.reconstruction`` also label the observed points by segment.
 
-    Raises ``ValueError`` for unusable clouds, and where nothing is found and no network can answer.
+    Raises ``ValueError`` for unusable clouds, and ``NoFit`` where no fit can start.
     """
     check_value("resolution", resolution, Cells, 128)
     check_value("scene_unit", scene_unit, PositiveOrUnknown, None)
     started = time.perf_counter()
     with stage("register the model"):
-        candidate, likelier = find(seen, model, registrar, keep_all, scene_unit)
-    answer = answer_candidate(seen, model, registrar, candidate, likelier)
+        candidate = find(seen, model, registrar, keep_all, scene_unit)
+    answer = answer_candidate(seen, model, registrar, candidate)
     return replace(answer, resolution=resolution, label_points=label_points, seconds=time.perf_counter() - started)
 
 
 def answer_candidate(
-    seen: Observation, model: Trained | None, registrar: Registrar | None, candidate: Candidate, likelier: EncodedFrame
+    seen: Observation, model: Trained | None, registrar: Registrar | None, candidate: Candidate
 ) -> Answer:
     """Answer a frame by what ``find`` or ``fit_states`` has found, with the parameters of the object's scene.
 
-    Takes the arguments of ``answer_frame``, and raises ``NoFit`` where nothing is found and no network can answer.
+    Takes the arguments of ``answer_frame``.
     """
-    if candidate.error is not None and model is None:
-        raise candidate.error
     modes = candidate.modes
-    answer = answer_of(seen, model, registrar, candidate, likelier, None if modes is None else modes.registration)
+    answer = answer_of(seen, model, registrar, candidate, None if modes is None else modes.registration)
     if registrar is not None and modes is not None:
         with stage("fit the parameters of the scene"):
             registration = registrar.finish(modes)
         if registration is not modes.registration:
-            answer = answer_of(seen, model, registrar, candidate, likelier, registration)
+            answer = answer_of(seen, model, registrar, candidate, registration)
     return answer
 
 
@@ -91,19 +89,16 @@ def answer_of(
     model: Trained | None,
     registrar: Registrar | None,
     candidate: Candidate,
-    likelier: EncodedFrame,
     registration: Registration | None,
 ) -> Answer:
-    """Make the answer of the best candidate: recognize the object, and choose between registration and network."""
+    """Make the answer of a candidate, and recognize the object in it."""
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
-    refusal = None if candidate.error is None else str(candidate.error)
     calibration = None if model is None else model.calibration
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
     doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or None
-    recognition = recognize(registration, calibration, stated, refusal, unseen, model is not None).doubted(doubt)
-    taken = registrar is not None and registration is not None and registrar.takes(registration)
-    used = candidate.encoded if taken else likelier
-    if taken and registrar is not None and registration is not None:
+    recognition = recognize(registration, calibration, stated, unseen, model is not None).doubted(doubt)
+    used = candidate.encoded
+    if registrar is not None and registration is not None:
         seen = in_registered_unit(seen, registrar, registration, recognition)
     return Answer(
         seen=seen.read_as(used.reading),
@@ -113,9 +108,8 @@ def answer_of(
         T_camera_input=used.T_camera_input,
         candidate=candidate,
         registration=registration,
-        taken=taken,
         recognition=recognition,
-        located_by=candidate.located_by if taken else "network",
+        located_by=candidate.located_by,
     )
 
 
@@ -131,10 +125,10 @@ def in_registered_unit(
 
 def find(
     seen: Observation, model: Trained | None, registrar: Registrar | None, keep_all: bool, scene_unit: float | None
-) -> tuple[Candidate, EncodedFrame]:
-    """Find the best fit to a frame by itself, and the hypothesis on its points that is likelier without a fit.
+) -> Candidate:
+    """Find the best fit to a frame by itself, or what the network alone answers.
 
-    Takes the arguments of ``answer_frame``, and raises as it does for unusable clouds.
+    Takes the arguments of ``answer_frame``, and raises as it does.
     """
     if seen.initial_pose is not None and (registrar is None or scene_unit_of(seen, registrar, scene_unit) is None):
         raise ValueError(
@@ -143,8 +137,7 @@ def find(
         )
     if registrar is not None:
         return search_hypotheses(seen, registrar, keep_all, scene_unit)
-    likelier = encode_frame(seen.readings(keep_all)[0], model, seen.frame.axes)
-    return Candidate(likelier, located_by="network"), likelier
+    return Candidate(encode_frame(seen.readings(keep_all)[0], model, seen.frame.axes), located_by="network")
 
 
 # --- outlier hypotheses -----------------------------------------------------------------------------------------------
@@ -156,23 +149,22 @@ SMALLEST, LARGEST = 0.05, 3.0
 """Longest side of a view, in those of the object at rest, beyond which a unit is wrong or the cloud another thing's."""
 
 
-def search_hypotheses(
-    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
-) -> tuple[Candidate, EncodedFrame]:
+def search_hypotheses(seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None) -> Candidate:
     """Search the object in the likelier hypothesis, and in the other where that explains too little.
 
-    Takes the arguments of ``answer_frame``, and raises as it does for unusable clouds. Returns the best candidate and
-    the likelier hypothesis.
+    Takes the arguments of ``answer_frame``, and raises as it does.
     """
-    unit, axes, network = scene_unit_of(seen, registrar, scene_unit), seen.frame.axes, registrar.starting_network
-    frames = (encode_frame(reading, network, axes) for reading in seen.readings(keep_all))
-    likelier = next(frames)
-    best = _searched(likelier, registrar, unit, seen)
-    for other in frames:
-        if best.is_accepted:
+    candidates, refusals = list[Candidate](), list[NoFit]()
+    for reading in seen.readings(keep_all):
+        try:
+            candidates.append(_searched(reading, registrar, scene_unit_of(seen, registrar, scene_unit), seen))
+        except NoFit as error:
+            refusals.append(error)
+        if candidates and candidates[-1].is_accepted:
             break
-        best = better(best, _searched(other, registrar, unit, seen))
-    return best, likelier
+    if not candidates:
+        raise refusals[0]
+    return reduce(better, candidates)
 
 
 def scene_unit_of(seen: Observation, registrar: Registrar, certain: float | None) -> float | None:
@@ -180,8 +172,9 @@ def scene_unit_of(seen: Observation, registrar: Registrar, certain: float | None
     return registrar.stated_scene_unit(seen.frame.unit_m) if certain is None else certain
 
 
-def _searched(frame: EncodedFrame, registrar: Registrar, scene_unit: float | None, seen: Observation) -> Candidate:
+def _searched(reading: Reading, registrar: Registrar, scene_unit: float | None, seen: Observation) -> Candidate:
     """Candidate of one hypothesis by a search, or from the initial pose that is given."""
+    frame = encode_frame(reading, registrar.starting_network, seen.frame.axes)
     if seen.initial_pose is None or scene_unit is None:
         return fit_states(frame, registrar, scene_unit, seen, matches=registrar.correspondences(frame.code))
     start = initial_state(frame.T_camera_input @ seen.initial_pose, registrar.model, scene_unit)
@@ -197,13 +190,10 @@ def fit_states(
     rounds: Sequence[SearchRound] = ROUNDS,
     matches: Correspondences | None = None,
 ) -> Candidate:
-    """Candidate of one hypothesis by ``search_modes``."""
+    """Candidate of one hypothesis by ``search_modes``; raises ``NoFit`` where that cannot start."""
     cloud = cloud_to_fit(frame, seen.lines, scene_unit)
-    try:
-        check_size(frame, registrar.model, scene_unit)
-        modes = search_modes(cloud, registrar.model, registrar.config, states, rounds, matches)
-    except NoFit as error:
-        return Candidate(frame, error=error)
+    check_size(frame, registrar.model, scene_unit)
+    modes = search_modes(cloud, registrar.model, registrar.config, states, rounds, matches)
     return Candidate(frame, replace(modes, calibration=registrar.calibration))
 
 
@@ -249,8 +239,7 @@ def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float |
 
 def better(first: Candidate, second: Candidate) -> Candidate:
     """Choose the fit that explains the greater share of all points; the first where both do."""
-    if first.modes is None or second.modes is None:
-        return first if second.modes is None else second
+    assert first.modes is not None and second.modes is not None
     tolerance = min(first.modes.tolerance, second.modes.tolerance)
     return first if first.explained(tolerance) >= second.explained(tolerance) else second
 

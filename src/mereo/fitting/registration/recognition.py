@@ -25,7 +25,7 @@ Of 295 right answers to training views of ten objects four lie beyond the first,
 (docs/experiments/075.md)."""
 
 MOST = 1e3
-"""Strangeness that is not exceeded, and that of a frame in which nothing was found."""
+"""Strangeness that is not exceeded, and that of a lost object."""
 
 LEAST: Mapping[str, float] = {
     "size": 0.01,
@@ -138,7 +138,7 @@ class Recognition:
         known: true, false, or "unsure".
         reason: why it is not true, a sentence with what to do; None where it is.
         strangeness: of all signs together, in standard deviations of what is usual.
-        signs: what it was made of; None where no registration was found.
+        signs: what it was made of; None where the network alone answers, and of a lost object.
         calibrated: whether what is usual was measured with the weights.
         has_weights: whether the object has any, which have learned its states; else its files say them.
     """
@@ -181,22 +181,20 @@ def recognize(
     registration: Registration | None,
     calibration: Calibration | None = None,
     stated_scene_unit: float | None = None,
-    refusal: str | None = None,
     unseen: float | None = None,
     has_weights: bool = True,
 ) -> Recognition:
     """Whether a frame shows the object, in a state that was learned; never true of a fit that is not accepted.
 
     Args:
-        registration: of the object's model to the frame; None where none was found or none was wanted.
+        registration: of the object's model to the frame; None where the network alone answers.
         calibration: of the weights, with what is usual.
         stated_scene_unit: length of a scene unit in the frame's unit, where the input states that.
-        refusal: why no registration was found; None where none was wanted, and then recognition is not possible.
         unseen: as in ``Signs``.
         has_weights: as in ``Recognition``.
     """
     if registration is None:
-        return NOT_EVALUATED if refusal is None else Recognition(False, refusal, MOST, has_weights=has_weights)
+        return NOT_EVALUATED
     calibrated = None if calibration is None else calibration.recognizing
     usual = calibrated or (OF_SOLIDS if registration.model.is_normal else CONSERVATIVE)
     signs = Signs.of(registration, stated_scene_unit, unseen)

@@ -231,9 +231,8 @@ class Registrar:
     Attributes:
         network: the weights, from whose guess a search begins; None of an object without.
         model: statistical model of the same object.
-        method: "modes" fits the modes; "full" the draws of the object's scene as well, and takes what has the lower
-            misfit; "auto" does the same where the scene is at hand, and else fits the modes; "search" is "auto"
-            without the network.
+        method: "auto" fits the modes, from a network's guess where there is one, and the draws of the object's scene,
+            where that is at hand; "search" is "auto" without the network; "modes" leaves the draws out.
         given: the object's scene, where it is not the built-in one that the weights were trained on.
         constants: of the fit of the modes; None for those that suit the kind of model.
     """
@@ -254,10 +253,10 @@ class Registrar:
         """Make the registrar of the model that the weights carry.
 
         ``scene`` is the object's scene, its name or its file, where it is not the built-in one of the weights. Raises
-        ``ValueError`` where the weights carry no statistical model, and as ``checked`` does.
+        ``ValueError`` where the weights carry no statistical model.
         """
         given = load_scene(scene) if isinstance(scene, str) else scene
-        return cls(network, statistical_model_of(network), method, given).checked()
+        return cls(network, statistical_model_of(network), method, given)
 
     @property
     def starting_network(self) -> Trained | None:
@@ -275,15 +274,6 @@ class Registrar:
         """Of the weights."""
         return None if self.network is None else self.network.calibration
 
-    def checked(self) -> "Registrar":
-        """Return itself; raise ``ValueError`` where ``method`` is "full" without the object's scene."""
-        if self.method == "full" and self.scene is None:
-            raise ValueError(
-                f"the weights were trained on {self.trained_scene!r}, which is no built-in scene; the fit "
-                "of a scene's draws plays it: name its file with --scene, or use --method modes"
-            )
-        return self
-
     @property
     def trained_scene(self) -> str:
         """Name of the scene that the weights were trained on, or else of the object's own; "" where there is none."""
@@ -295,15 +285,15 @@ class Registrar:
     def scene(self) -> Scene | None:
         """Scene whose draws can be played: the given one, or the built-in one of the weights; None where neither is.
 
-        Where the weights' own scene has other meshes since, it is None with a ``ChangedSceneWarning``, and with "full"
-        a ``ValueError``, as a given scene of another object is. Raises ``AssetUnavailable`` where its mesh is missing.
+        Where the weights' own scene has other meshes since, it is None with a ``ChangedSceneWarning``. Raises
+        ``ValueError`` for a given scene of another object, and ``AssetUnavailable`` where its mesh is missing.
         """
         name = self.trained_scene
         scene = self.given if self.given is not None else load_scene(name) if name in SCENES else None
         fault = None if scene is None else other_mesh(scene, self.model)
         if scene is None or fault is None:
             return scene
-        if self.method != "full" and scene.name == name:
+        if scene.name == name:
             warnings.warn(
                 f"{fault}: it has changed since they were trained, so only the modes of that model are fitted; train "
                 "them again for the fit of its draws",
@@ -355,25 +345,19 @@ class Registrar:
     def finish(self, fitted: ModesFit) -> Registration:
         """Return the registration from a fit of the modes, with the draws too where ``method`` wants them.
 
-        Unless that is "full", not where the modes do not explain the frame: the draws, which begin there and take
-        longest on such frames, did not explain one of them either (experiments, entry 62).
+        Not where the modes do not explain the frame: the draws, which begin there and take longest on such frames, did
+        not explain one of them either (experiments, entry 62).
         """
-        modes = fitted.registration
-        hopeless = self.method != "full" and not modes.accepted
-        states = None if not self.fits_draws or hopeless or not fitted.may_take_draws else self.states_or_none
+        is_drawn_too = self.fits_draws and fitted.registration.accepted and fitted.may_take_draws
+        states = self.states_or_none if is_drawn_too else None
         return fitted.settled().registration if states is None else fitted.with_draws(states)
-
-    def takes(self, registration: Registration) -> bool:
-        """Whether a registration is the answer: one that explains its frame; any where nobody else can answer."""
-        return registration.accepted or self.method != "auto" or self.network is None
 
     @cached_property
     def states_or_none(self) -> DrawnStates | None:
         """Random states of the scene, among which a fit of its draws starts; they take seconds once.
 
         None without a scene, for a rigid object, for an elastic solid, whose modes are its draws, for more than
-        ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the weights carry all that the modes need. With
-        "full" that raises ``AssetUnavailable``.
+        ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the weights carry all that the modes need.
         """
         model = self.model
         try:
@@ -387,9 +371,7 @@ class Registrar:
             with stage("simulate random states of the scene, once for an object"):
                 return DrawnStates.of(self.scene, model)
         except AssetUnavailable:
-            if self.method != "full":
-                return None
-            raise
+            return None
 
 
 def registrar_for(model: Trained, method: AnswerMethod, scene: Scene | str | None = None) -> Registrar | None:
