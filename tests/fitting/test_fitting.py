@@ -192,19 +192,6 @@ def test_a_frame_that_says_nothing_narrows_no_state_whatever_distances_are_kept(
     assert narrowing(silent, fitted.posed) == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_second_pass_follows_where_the_first_has_failed(
-    problem: DrawsProblem, fitted: ModesFit, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Modes that are wrong and a single step leave the cloud unexplained; a pass from there comes nearer."""
-    wrong = replace(fitted.posed, z=np.full_like(fitted.posed.z, 2.0))
-    poor = replace(problem.config, starts=1, sieve=((1, 1),), kept=1, last_rounds=0, steps=1, hopeless=0.0)
-    poor = replace(poor, jumps=0)
-    once, twice = (fit_draws(replace(problem, config=replace(poor, passes=n)), wrong) for n in (0, 1))
-    assert once is not None and twice is not None and twice.misfit < 0.9 * once.misfit
-    monkeypatch.setattr("mereo.fitting.draws.fit.refine", None)  # not called where the first explains the cloud
-    assert fit_draws(replace(problem, config=replace(problem.config, passes=1, hopeless=9.0)), fitted.posed) is not None
-
-
 def test_modes_reproduce_states_they_were_not_built_from(model: StatisticalModel) -> None:
     for index in range(5):
         state = state_points(SCENE.sample_state(example_rng(7, index)), model.nodes, model.node_labels)

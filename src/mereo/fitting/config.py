@@ -61,19 +61,8 @@ class DrawsConfig:
         sieve: sets of differences spent on each start, and on how many of the best, one stage after the other.
         kept: how many of them are then fitted to the frame.
         cloud_weight: how many independent points the cloud is worth, also where draws and modes are compared.
-        last_rounds: sets of differences in the fit to the frame; one after a jump.
+        last_rounds: sets of differences in the fit to the frame.
         steps: at most with one set of differences.
-        explained: the cloud's misfit above which draws may jump.
-        hopeless: the same, above which the next starts are tried, in at most ``batches`` of them.
-        passes: while it is above ``hopeless``, how often the modes are refined from where the draws ended, and the
-            draws fitted to that shape again.
-        jumps: how often one draw may jump to another position of its range.
-        jump_steps, jumps_kept: into how many even steps its range is divided, so that a draw may jump to one position
-            fewer; and how many of these, the best, are compared: all where None.
-        sliding: most share of a draw's motion that may leave the surface; 1 lets all draws jump.
-        turned_worse: misfit by which a state may be worse with segments stiffly turned that look alike turned
-            (``symmetric_groups``), for that shape to be tried.
-        every_point: whether the answer is fitted to every observed point in the end.
     """
 
     starts: int = 40
@@ -82,16 +71,6 @@ class DrawsConfig:
     cloud_weight: float = 1500.0
     last_rounds: int = 2
     steps: int = 6
-    explained: float = 0.125
-    hopeless: float = 0.25
-    batches: int = 1
-    passes: int = 0
-    jumps: int = 2
-    jump_steps: int = 6
-    jumps_kept: int | None = None
-    sliding: float = 1.0
-    turned_worse: float = 25.0
-    every_point: bool = True
 
 
 ELASTIC = FitConfig(
@@ -100,23 +79,6 @@ ELASTIC = FitConfig(
 """Constants for objects whose model is that of an elastic solid, which real states are near but never in.
 
 What they are off by is shared by many points, so the cloud is worth fewer; experiments, entry 68."""
-
-MANY_DRAWS = DrawsConfig(
-    cloud_weight=3000.0,
-    batches=2,
-    passes=1,
-    starts=16,
-    kept=1,
-    sieve=((1, 3), (1, 1)),
-    last_rounds=4,
-    jump_steps=12,
-    jumps_kept=1,
-    sliding=0.2,
-    every_point=False,
-)
-"""Constants for scenes with more than ``FEW_DRAWS``: every set of differences plays each draw once."""
-
-FEW_DRAWS = 30
 
 
 StreamMethod = Literal["auto", "network", "search"]

@@ -4,30 +4,21 @@ Around a state the material points are linear in the draws, so its neighbourhood
 modes, with the same residuals. The scene is played with the draws that fit best there, and so on, from several starts.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
-import igl
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial.transform import Rotation
-from scipy.special import ndtr, ndtri
 
 from mereo.deformation.moving_least_squares import PointWeights, spread
-from mereo.fitting.config import FEW_DRAWS, MANY_DRAWS, DrawsConfig
+from mereo.fitting.config import DrawsConfig
 from mereo.fitting.draws.playback import (
-    NO_DIRECTIONS,
-    Directions,
     Drawn,
     DrawnStates,
     as_sparse,
     material_moved,
-    shares_of,
 )
-from mereo.fitting.modes import refine, robust_poses
+from mereo.fitting.modes import robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import (
@@ -39,12 +30,8 @@ from mereo.fitting.problem.residuals import (
     robust_square,
     silhouette_losses,
 )
-from mereo.fitting.problem.segments import SegmentTurns, branches, find_segment_turns
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.transforms import best_rotations
-from mereo.scenes.draw_recorder import SMOOTH, OutOfDraws, Recorder
-from mereo.scenes.parameters import play, played_back
-from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- a frame, and states compared with it -----------------------------------------------------------------------------
@@ -72,13 +59,11 @@ class DrawsProblem:
     @property
     def last(self) -> Problem:
         """``base`` with the points of the last descent."""
-        return self.base.by_every_point if self.config.every_point else self.base
+        return self.base.by_every_point
 
     @classmethod
-    def of(cls, base: Problem, states: DrawnStates, config: DrawsConfig | None = None) -> "DrawsProblem":
-        """Problem with the constants for as many draws as the scene has, where none are given."""
-        if config is None:
-            config = DrawsConfig() if states.z.shape[1] <= FEW_DRAWS else MANY_DRAWS
+    def of(cls, base: Problem, states: DrawnStates, config: DrawsConfig = DrawsConfig()) -> "DrawsProblem":  # noqa: B008 (frozen)
+        """Problem with the weights that the draws are fitted by."""
         fit_config = replace(base.config, cloud_weight=config.cloud_weight)
         return cls(replace(base, config=fit_config), states, config)
 
@@ -349,14 +334,12 @@ GAIN = 0.003
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
-    """Fit the draws from several starts, and improve the best; None where the scene plays none of them back."""
-    fits: list[DrawsFit] = []
-    for start in (fit_near_modes, *(fit_from_end,) * problem.config.passes):
-        fits += start(problem, modes, fits)
-    best = min(fits, key=by_misfit, default=None)
-    for improve in (try_symmetric_states, try_jumps, refine_by_sight):
-        best = None if best is None else improve(problem, best)
-    return best
+    """Fit the draws from states like a fit of the modes; None where the scene plays none of them back."""
+    states, shape = problem.states, Shape.of_material(problem, problem.model.material(modes.z))
+    guess = states.guess(modes.z, problem.model.motion)
+    starts = (lay_on_shape(states, shape, start, start.z) for start in (*similar_states(problem, shape), guess))
+    fits = descend_best(problem, modes, shape, [start for start in starts if start is not None])
+    return refine_by_sight(problem, min(fits, key=by_misfit)) if fits else None
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
@@ -388,52 +371,11 @@ def settled(problem: DrawsProblem, fit: DrawsFit) -> tuple[DrawsProblem, DrawsFi
     return replace(worth, base=fit.base), fit
 
 
-def fit_near_modes(
-    problem: DrawsProblem, modes: Posed, fits: list[DrawsFit], others: Sequence[Drawn] = ()
-) -> list[DrawsFit]:
-    """Fit from states like a fit of the modes, and from ``others``."""
-    guess = problem.states.guess(modes.z, problem.model.motion)
-    return fit_from_shape(problem, modes, Shape.of_material(problem, problem.model.material(modes.z)), [guess, *others])
-
-
-def fit_from_end(problem: DrawsProblem, modes: Posed, fits: list[DrawsFit]) -> list[DrawsFit]:
-    """Fit from the modes' fit to where the draws ended, if far off: it may lie in another basin than their first."""
-    if not fits or explains_cloud(problem, fits, problem.config.hopeless):
-        return []
-    best = min(fits, key=by_misfit)
-    pose, z = problem.model.project(best.surface.material)
-    scale = float(np.cbrt(np.linalg.det(pose[:3, :3])))
-    modes = refine(problem.base, Posed(pose[:3, :3] / scale, pose[:3, 3], z, float(np.log(scale))))
-    return fit_near_modes(problem, modes, fits, [replace(best.drawn, z=best.z)])
-
-
-def explains_cloud(problem: DrawsProblem, fits: list[DrawsFit], most: float) -> bool:
-    """Whether one of the states explains the cloud: ``Problem.explained``."""
-    sigma = problem.base.cloud_sigma
-    misfits = [float(robust_square(fit.distance, sigma).mean()) for fit in fits]
-    return bool(fits) and problem.base.explained(min(misfits), fits[int(np.argmin(misfits))].surface, most)
-
-
-def fit_from_shape(problem: DrawsProblem, frame: Posed, shape: Shape, guesses: list[Drawn]) -> list[DrawsFit]:
-    """Fit from starts like a shape, which ``frame`` poses in the camera frame; the next ones while that is hopeless."""
-    config, states = problem.config, problem.states
-    drawn = [states.drawn(seed) for seed in similar_states(problem, shape)] + guesses
-    near_shape = [lay_on_shape(states, shape, start, start.z) for start in drawn]
-    starts = sorted((start for start in near_shape if start is not None), key=by_misfit)
-    batch, fits = config.sieve[0][1], list[DrawsFit]()
-    for number in range(config.batches):
-        fits += descend_best(problem, frame, shape, starts[number * batch : (number + 1) * batch])
-        if explains_cloud(problem, fits, config.hopeless):
-            break
-    return fits
-
-
 def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list[StateOnShape]) -> list[DrawsFit]:
     """Descend from the best of some starts."""
     config, states = problem.config, problem.states
     for fresh, keep in config.sieve:
         starts = [approach(states, shape, start, fresh) for start in sorted(starts, key=by_misfit)[:keep]]
-        starts += find_other_choices(problem, shape, min(starts, key=by_misfit, default=None))
     fits = []
     for start in starts:
         translation = frame.place(start.translation[None])[0]
@@ -445,85 +387,14 @@ def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list
     return [descend(problem, fit, config.last_rounds, motion) for fit, motion in best]
 
 
-def find_other_choices(problem: DrawsProblem, shape: Shape, best: StateOnShape | None) -> list[StateOnShape]:
-    """Find states near a shape that ``best`` does not meet, made from that one by other discrete draws."""
-    states = problem.states
-    if best is None or best.misfit < 100.0:
-        return []
-    others = redraw_choices(states.scene, replace(best.drawn, z=best.z), 100, states.directions)
-    states_near = [lay_on_shape(states, shape, other, other.z) for other in others]
-    # a choice may come out the same again
-    new = [near for near in states_near if near is not None and np.abs(near.points - best.points).max() > shape.std]
-    return [approach(states, shape, state, 1) for state in sorted(new, key=by_misfit)[:4]]
-
-
-def similar_states(problem: DrawsProblem, shape: Shape) -> list[int]:
-    """Seeds of the random states most like a shape."""
+def similar_states(problem: DrawsProblem, shape: Shape) -> list[Drawn]:
+    """Random states most like a shape."""
     states = problem.states
     some = spread(shape.points, 150)
     library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
     equal = np.ones(len(some), dtype=np.float32)
     cost = robust_poses(library[:, some], goal, equal, problem.base.first_sigma)[0]
-    return [states.seeds[row] for row in np.argsort(cost)[: problem.config.starts]]
-
-
-def try_symmetric_states(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """Try states with segments turned that look alike turned, as a forearm by half a turn; return the best.
-
-    Only where the shape, stiffly turned, explains the frame nearly as well.
-    """
-    config = problem.config
-    few = replace(problem, config=replace(config, sieve=((1, 4), (1, 1)), kept=1, batches=1))
-    for together in symmetric_groups(problem.model):
-        material = turn_segments(problem.model, fit.material, together)
-        stiff = score_material(problem, fit.drawn, fit.z, fit.posed, material)
-        if stiff is not None and stiff.misfit < fit.misfit + config.turned_worse:
-            fits = fit_from_shape(few, fit.posed, Shape.of_material(problem, material), [])
-            fit = min([fit, *fits], key=by_misfit)
-    return fit
-
-
-def try_jumps(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
-    """Try single draws anywhere in their range, as a wheel by half a turn, while the cloud is not explained."""
-    config = problem.config
-    sigma = first_sigma(problem)
-    for _ in range(config.jumps):
-        if explains_cloud(problem, [fit], config.explained):
-            break
-        each = [find_jumps(problem, fit, int(number), sigma) for number in draws_that_may_jump(problem, fit)]
-        best_first = sorted((jump for jumps in each for jump in jumps), key=lambda jump: jump[0])
-        fits = [descend(problem, other, 1) for _, other in best_first[: config.kept + 1]]
-        best = min(fits, key=by_misfit, default=fit)
-        if best.misfit >= fit.misfit:
-            break
-        fit = descend(problem, best, 1)
-    return fit
-
-
-def find_jumps(problem: DrawsProblem, fit: DrawsFit, number: int, sigma: float) -> list[tuple[float, DrawsFit]]:
-    """Simulate one draw at other positions of its range: all, or the best where draws are many, with misfits."""
-    config, candidates = problem.config, list[tuple[float, DrawsFit]]()
-    for turn in range(1, config.jump_steps):
-        z = fit.z.copy()
-        z[number] = ndtri(np.clip((ndtr(z[number]) + turn / config.jump_steps) % 1.0, 1e-4, 1 - 1e-4))
-        other = simulate(problem, fit.drawn, z, fit.posed)
-        if other is not None:
-            candidates.append((misfit(problem, other, sigma), other))
-    return sorted(candidates, key=lambda candidate: candidate[0])[: config.jumps_kept]
-
-
-def draws_that_may_jump(problem: DrawsProblem, fit: DrawsFit) -> Int[np.ndarray, " n"]:
-    """Choose draws that may jump: of many, those that move a part along its own surface, as a ring on its post."""
-    smooth = np.flatnonzero(fit.drawn.smooth)
-    if problem.config.sliding >= 1.0 or fit.motion is None:
-        return smooth
-    model, index = problem.model, problem.states.played.index
-    surface = index < sum(model.vertex_counts)
-    motion = fit.motion[surface][:, :, smooth].astype(np.float64)
-    normal = igl.per_vertex_normals(fit.material[: sum(model.vertex_counts)], model.faces)[index[surface]]
-    moved, off = (motion**2).sum(axis=(0, 1)), (np.einsum("ac,acd->ad", normal, motion) ** 2).sum(axis=0)
-    farthest = np.sqrt((motion**2).sum(axis=1).max(axis=0, initial=0.0))
-    return smooth[(off < problem.config.sliding * moved) & (farthest > 0.03 * model.half)]
+    return [states.drawn(states.seeds[row]) for row in np.argsort(cost)[: problem.config.starts]]
 
 
 def first_sigma(problem: DrawsProblem) -> float:
@@ -568,76 +439,3 @@ def lower(
                 return tried, motion, max(damping / 6.0, 1e-3)
         damping *= 6.0
     return fit, motion, damping
-
-
-# --- other discrete choices -------------------------------------------------------------------------------------------
-
-
-def redraw_choices(scene: Scene, drawn: Drawn, count: int, directions: Directions = NO_DIRECTIONS) -> list[Drawn]:
-    """Redraw some of the discrete draws of a state, and what depends on them; fewer than ``count`` where refused.
-
-    Discrete draws are such as how many corners of a sheet are folded: derivatives do not reach across them, and random
-    states hold one combination too seldom to be near everything else. All other draws are kept. Nothing where the scene
-    has no discrete draws. The same state gives the same ones.
-    """
-    calls = played_back(scene, drawn.seed, shares_of(drawn.z, drawn.sizes)).calls
-    discrete = np.array([number for number, call in enumerate(calls) if call.kind not in SMOOTH], dtype=int)
-    if not len(discrete):
-        return []
-    rng, redrawn = np.random.default_rng(drawn.seed), list[Drawn]()
-    for _ in range(count):
-        taken = rng.random(len(discrete)) < 0.5
-        taken[rng.integers(len(discrete))] = True
-        seed = int(rng.integers(2**31))
-        given = {call.key: call.shares for number, call in enumerate(calls) if number not in discrete[taken]}
-        # a scene that asks for more calls than these has thrown its first attempt away
-        recorder = Recorder(seed, given, len(calls) + 12)
-        try:
-            play(scene, recorder)
-        except (OutOfDraws, ValueError):
-            continue
-        redrawn.append(Drawn.recorded(recorder.calls, seed, directions))
-    return redrawn
-
-
-# --- segments turned by their symmetries ------------------------------------------------------------------------------
-
-# An arm looks the same with the forearm half a turn round, the wrist bent the other way and the hand turned back. No
-# jump of one draw leads there, but the shape is known, so that the draws can approach it as that of the modes.
-
-Twins = tuple[tuple[SegmentTurns, float], ...]
-"""Segments that hang on each other, and the angle by which each is turned."""
-
-
-@lru_cache(maxsize=8)
-def symmetric_groups(model: StatisticalModel) -> tuple[Twins, ...]:
-    """Groups of two segments or more that hang on each other and each look alike in exactly one other turn.
-
-    Others are left to single draws, which slide along their surface.
-    """
-    single = dict[int, tuple[SegmentTurns, float]]()
-    for turn in find_segment_turns(model):
-        middle = float(turn.angles.mean())
-        if np.abs(turn.angles - middle).max() <= np.deg2rad(15.0):  # one run of two or three, 10 degrees apart
-            single[turn.label - 1] = turn, middle
-    if len(single) < 2:
-        return ()
-    touch = np.zeros((len(model.anchors),) * 2, dtype=bool)
-    for a, b, _ in branches(model):
-        touch[a, b] = a in single and b in single
-    count, group = connected_components(touch, directed=False)
-    members = [
-        tuple(single[label] for label in np.flatnonzero(group == i).tolist() if label in single) for i in range(count)
-    ]
-    return tuple(some for some in members if len(some) > 1)
-
-
-def turn_segments(
-    model: StatisticalModel, material: Float[np.ndarray, "m 3"], together: Twins
-) -> Float[np.ndarray, "m 3"]:
-    """Material points of a state with some segments turned, each stiffly about its own axis."""
-    moved = material.copy()
-    for turn, angle in together:
-        rows, center, axis = turn.posed(model, material)
-        moved[rows] = Rotation.from_rotvec(angle * axis).apply(material[rows] - center) + center
-    return moved

@@ -1,79 +1,27 @@
-"""States beside one: all that was drawn is kept but a choice, or a joint; neighbours need no test of the scene."""
+"""States beside one: their directions, played without the scene's own test, and with one joint moved."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from answers import fit_modes
-from fit_cases import IN_FRONT, seen
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtr
 from shapes import box
-from toy_scene import Shear, rest_mesh, toy_scene
+from toy_scene import rest_mesh
 
-from mereo.deformation.draw_names import named, part
+from mereo.deformation.draw_names import named
 from mereo.deformation.maps import Deformation
-from mereo.fitting.draws.fit import redraw_choices
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.segments import Joints
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import transform_points, unit_rows
-from mereo.scenes.parameters import random_state
-from mereo.scenes.random_states import build_model, scene_model, state_points
+from mereo.geometry.transforms import unit_rows
+from mereo.scenes.random_states import build_model, scene_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene, Workspace
 from mereo.scenes.statistical_model import StatisticalModel
-
-SIDES = 4
-"""Options of the discrete draw: no side, or one of three boxes is pushed out."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pushed:
-    distance: float
-    then: Shear
-
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        return self.then(points + np.array([0.0, self.distance, 0.0]))
-
-
-def sample_deformations(rng: Generator) -> tuple[Deformation, ...]:
-    shear = Shear(*(named(rng, "shear").uniform(-1, 1, size=3) * [3.0, 0.3, 0.2]))
-    box = int(named(rng, "box").choice(SIDES))
-    maps: list[Deformation] = [shear] * 4
-    if box < 3:
-        with part(rng, f"box {box}"):
-            maps[box] = Pushed(float(named(rng, "distance").uniform(4.0, 6.0)), shear)
-    return tuple(maps)
-
-
-SCENE = Scene("pushed", rest_mesh(), sample_deformations, Workspace())
-
-
-def box_of(drawn: Drawn) -> int:
-    """Option of a state's discrete draw, the fourth number."""
-    return int(ndtr(drawn.z[3]) * SIDES)
-
-
-@pytest.mark.parametrize("seed", [1001, 1002, 1003])
-def test_all_but_the_choice_and_what_it_asks_for_is_kept(seed: int) -> None:
-    drawn = Drawn.of(SCENE, seed)
-    others = redraw_choices(SCENE, drawn, 40)
-    assert {box_of(other) for other in others} == set(range(SIDES))
-    for other in others:
-        assert_allclose(other.z[:3], drawn.z[:3])
-        assert len(other.z) == (4 if box_of(other) == 3 else 5)
-        assert other.deformations(SCENE, other.z) is not None
-        if box_of(other) == box_of(drawn):
-            assert_allclose(other.z[4:], drawn.z[4:])
-
-
-def test_a_scene_without_discrete_draws_has_no_others() -> None:
-    assert redraw_choices(toy_scene(), Drawn.of(toy_scene(), 1001), 10) == []
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,27 +50,6 @@ def test_what_is_a_direction_is_seen_by_what_its_length_moves() -> None:
     assert_allclose(drawn.z[-3:], plain.z[-3:])
     before, after = (states.played.moved(plain.deformations(scene, z) or ()) for z in (plain.z, drawn.z))
     assert_allclose(after, before, atol=1e-6)
-
-
-def states_with(model: StatisticalModel, box: int, count: int) -> DrawnStates:
-    """States of the first seeds that push this box."""
-    seeds = [seed for seed in range(1000, 1200) if box_of(Drawn.of(SCENE, seed)) == box][:count]
-    each = [DrawnStates.of(SCENE, model, 1, seed) for seed in seeds]
-    columns = {name: np.concatenate([getattr(one, name) for one in each]) for name in ("material", "z", "modes")}
-    return replace(each[0], seeds=tuple(seeds), **columns)
-
-
-def test_a_choice_that_no_start_has_made_is_found() -> None:
-    """All states that a fit may start from push no box; the frame shows one that is pushed."""
-    model = scene_model(SCENE, count=200)
-    pushed = states_with(model, 1, 1).seeds[0]
-    state = SCENE.deform(random_state(SCENE, pushed).deformations)
-    material = transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
-    fitted = fit_modes(seen(state.mesh.transformed(IN_FRONT)), model, 1.0, material)
-    found = fitted.with_draws(states_with(model, 3, 16))
-    assert found.method == "draws" and found.drawn is not None
-    assert box_of(found.drawn) == 1
-    assert np.median(norm(found.material - material, axis=1)) < 0.05
 
 
 REFUSES = {"human": 7, "robot": 3, "rope": 1, "sheet": 5}
