@@ -17,7 +17,7 @@ from typing import Any
 from mereo.api.words import check_names, names_of, python_words
 from mereo.deformation.samplers import RandomMotion
 from mereo.fitting.config import AnswerMethod
-from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for, statistical_model_of
+from mereo.fitting.registration.register import Registrar, other_mesh, registrar_for
 from mereo.geometry.conventions import LengthUnit, Names, Range, Way
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import check_value
@@ -54,6 +54,7 @@ class Object:
         scene: how it deforms, where that is not the built-in scene that the weights were trained on.
         model: statistical model of its states; by default that of the weights, None where these carry none.
         known_as: its name, where neither weights nor a scene have it.
+        knows_joints: whether it is of ``with_joints``.
     """
 
     network: Trained | None
@@ -61,6 +62,7 @@ class Object:
     _registrars: dict[str, Registrar | None] = field(default_factory=dict)
     model: StatisticalModel | None = None
     known_as: str = ""
+    knows_joints: bool = False
     _narrowed: "dict[tuple[Range, ...], Object]" = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -100,10 +102,11 @@ class Object:
         assert self.model is not None
         return self.model.rest
 
-    def registrar(self, method: AnswerMethod = "auto") -> Registrar | None:
+    def registrar(self, method: AnswerMethod = "auto", frame_joints: object = None) -> Registrar | None:
         """Registrar of the object's deformation model for a method, set up once; None where the network alone answers.
 
-        Raises ``ValueError`` for a method that there is none of, and where it cannot be had of this object.
+        Raises ``ValueError`` for a method that there is none of, where it cannot be had of this object, and where the
+        network alone answers though values of joints are known, before all frames or, as ``frame_joints``, with each.
         """
         check_value("method", method, AnswerMethod, "auto")
         if method == "network" and self.network is None:
@@ -112,29 +115,19 @@ class Object:
             )
         if method not in self._registrars:
             self._registrars[method] = self._registrar(method)
-        return self._registrars[method]
+        registrar = self._registrars[method]
+        if registrar is None and (self.knows_joints or frame_joints):
+            raise ValueError(
+                "values of joints are given, but the method is network, and a network alone takes none: leave them "
+                "out, or take another method"
+            )
+        return registrar
 
     def _registrar(self, method: AnswerMethod) -> Registrar | None:
         if self.network is not None:
             return registrar_for(self.network, method, self.scene)
         assert self.model is not None
         return Registrar(None, self.model, method, self.scene)
-
-    def with_deformation_model(self) -> "Object":
-        """The same with a statistical model; weights that carry none get that of their built-in scene, in seconds.
-
-        Raises ``ValueError`` where it cannot be had.
-        """
-        return self if self.network is None else self._moved_by(statistical_model_of(self.network), self.scene)
-
-    def _moved_by(self, model: StatisticalModel, scene: Scene | None) -> "Object":
-        """The same with another statistical model and scene."""
-        if self.network is None:
-            return Object(None, scene, model=model, known_as=self.known_as)
-        from mereo.models.model import Model  # torch is there, as the network is
-
-        assert isinstance(self.network, Model)
-        return Object(replace(self.network, statistical_model=model), scene)
 
     @python_words()
     def with_joints(self, joints: object) -> "Object":
@@ -152,7 +145,10 @@ class Object:
             self._narrowed.clear()
             with stage("make the statistical model of the states that the given joints leave"):
                 model = narrowed_model(scene, self.model or kept_model(scene))
-            self._narrowed[key] = self._moved_by(model, scene)
+            network: Any = self.network
+            if network is not None:  # weights, which torch has loaded
+                network = replace(network, statistical_model=model)
+            self._narrowed[key] = Object(network, scene, {}, model, self.known_as, True)
         return self._narrowed[key]
 
     def asking(self, network: Trained | None) -> "Object":
@@ -161,7 +157,7 @@ class Object:
             method: None if registrar is None else registrar.asking(network)
             for method, registrar in self._registrars.items()
         }
-        return Object(network, self.scene, moved, self.model, self.known_as)
+        return Object(network, self.scene, moved, self.model, self.known_as, self.knows_joints)
 
 
 class WithoutWeightsWarning(UserWarning):

@@ -107,9 +107,8 @@ class FrameJob:
 
     @cached_property
     def object(self) -> Object:
-        """What is looked for, its weights on their device; what is carried needs a deformation model."""
-        loaded = loaded_object(self.command, self.inference)
-        return loaded.with_deformation_model() if self.attachments else loaded
+        """What is looked for, its weights on their device."""
+        return loaded_object(self.command, self.inference)
 
     @cached_property
     def registrar(self) -> Registrar | None:
@@ -119,8 +118,11 @@ class FrameJob:
     @cached_property
     def placed(self) -> tuple[Placed, ...]:
         """What is carried, in its place on the object at rest."""
-        registrar = self.registrar
-        return () if registrar is None else tuple(place(self.attachments, registrar, self.command.carry_frame))
+        if not self.attachments:
+            return ()
+        registrar = self.registrar or self.object.registrar("modes")  # raises for weights without a deformation model
+        assert registrar is not None
+        return tuple(place(self.attachments, registrar, self.command.carry_frame))
 
     def asking(self, network: Trained | None) -> "FrameJob":
         """The same, asking the same weights on another device; what is known of scene and attachments stays so."""

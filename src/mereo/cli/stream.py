@@ -414,7 +414,7 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
     known = loaded_object(replace(command, joints=steady))
     answer = Answering(
         known.network,
-        known.registrar(command.method),
+        known.registrar(command.method, command.joints),
         command.resolution,
         command.isolation.keep_all,
         command.uncertainty,

@@ -348,9 +348,9 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
 
     Args:
         scene: with joints that have names.
-        given: values by these names, each a number, or a dict of ``value`` and ``within``, the largest error; radians,
-            or metres of joints that slide. Or lists ``name`` and ``position``, as a dict or a ``JointState`` of ROS,
-            of which joints that the scene lacks are passed over. Or a YAML or JSON file of either.
+        given: values by these names, each a number, a result's ``JointValue``, or a dict of ``value`` and ``within``,
+            the largest error; radians, or metres of joints that slide. Or lists ``name`` and ``position``, as a dict
+            or a ``JointState`` of ROS, of which joints that the scene lacks are passed over. Or a YAML or JSON file.
 
     A joint that follows another one gives that one's value. What was given before still holds: a value within it
     narrows it, and another one contradicts it. Raises ``FileNotFoundError``, and ``ValueError`` where the scene has no
@@ -444,7 +444,7 @@ def _values(given: Any, names: list[str]) -> dict[str, Range]:
     for name, value in given.items():
         if name not in names:
             raise ValueError(f"no joint is called {name!r}; it must be one of {', '.join(names)}: correct it")
-        parts = {"within": 0.0, **(value if isinstance(value, Mapping) else {"value": value})}
+        parts = {"within": 0.0, **(value if isinstance(value, Mapping) else {"value": getattr(value, "value", value)})}
         if parts.keys() != {"value", "within"}:
             raise ValueError(
                 f"joint {name!r} is {value_text(value)}; it must be a number, or `value` and `within`, its largest "
