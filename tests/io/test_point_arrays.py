@@ -108,10 +108,10 @@ def altered(**changes: Any) -> SimpleNamespace:
 IMAGE = "is an image of depths, which needs the camera's intrinsics: give intrinsics=, .* or mereo.DepthImage.depth, "
 
 REFUSED = {
-    "number": (3.5, "^the float cannot be read as a frame"),
-    "generator": (generated(), "^the generator cannot be read as a frame"),
-    "empty tensor map": (SimpleNamespace(point=TensorMap()), "^the SimpleNamespace cannot be read as a frame"),
-    "class": (trimesh.PointCloud, "^the ABCMeta cannot be read as a frame"),
+    "number": (3.5, "^the float cannot be read as points"),
+    "generator": (generated(), "^the generator cannot be read as points"),
+    "empty tensor map": (SimpleNamespace(point=TensorMap()), "^the SimpleNamespace cannot be read as points"),
+    "class": (trimesh.PointCloud, "^the ABCMeta cannot be read as points"),
     "table": (SimpleNamespace(columns=["z", "y", "x"], points=POINTS), r"is a table.*give table\[\['x', 'y', 'z'\]\]"),
     "frames in lists": ((POINTS.tolist(),), "^the tuple holds 1 frame; one"),
     "four columns": (np.ones((9, 4)), r"^the ndarray of shape .9, 4. is not a point cloud.*as points\[..., :3\]"),

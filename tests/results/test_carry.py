@@ -144,7 +144,7 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
 
 def test_far_away_things_are_refused(registrar: Registrar) -> None:
     points = default_rng(0).uniform(*SCENE.rest.bounds, size=(100, 3))
-    with pytest.raises(ValueError, match="of 100 points of one are farther from the object than it is long"):
+    with pytest.raises(ValueError, match="one: .* of 100 points are farther from the object than it is long"):
         placed_one(registrar, Positions(1000 * points))
     assert placed_one(registrar, Positions(points)).distance.max() < 20
 

@@ -134,7 +134,7 @@ def _positions(source: Any) -> tuple[Points, Points | None, str, bool]:
         carried = _carried(source)
         if carried is None and not any(hasattr(source, name) for name in ("__array__", "numpy")):
             raise ValueError(
-                f"{kind} cannot be read as a frame; one of these is needed: an array, tensor or nested list of n x 3 "
+                f"{kind} cannot be read as points; one of these is needed: an array, tensor or nested list of n x 3 "
                 "numbers, an organized array of h x w x 3, a structured array with fields x, y and z, an object with "
                 "points or vertices (Open3D, trimesh, PyVista), a PointCloud2 message, or a mereo.PointCloud or "
                 "mereo.DepthImage"

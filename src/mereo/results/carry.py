@@ -180,8 +180,8 @@ def _placed(attachment: Attachment, T_scene_file: Transform, model: StatisticalM
     far = int((distance > size).sum())
     if far > len(distance) / 2:
         raise ValueError(
-            f"{far} of {len(distance)} points of {name} are farther from the object than it is long (in the middle "
-            f"{np.median(distance):.4g} scene units, and it has {size:.4g}); it must lie in or near the object: "
+            f"{name}: {far} of {len(distance)} points are farther from the object than it is long (the median one "
+            f"{np.median(distance):.4g} scene units, its length is {size:.4g}); they must lie in or near the object: "
             "bring it to the frame and unit of the object's own files, or say --carry-frame scene if it is in scene "
             "units"
         )
