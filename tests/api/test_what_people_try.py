@@ -489,7 +489,6 @@ REFUSED = {
     "a large grid": (lambda: answered(resolution=4096).surfaces, "at most 80000000 fit: lower"),
     "an index": (lambda: load_frame(seen(), frame_index=-1), "^frame_index is -1; it must be a whole number, at"),
     "a complex cloud": (lambda: PointCloud(seen() * 1j), "values of type complex128; they must be real numbers"),
-    "a boolean cloud": (lambda: PointCloud(seen() > 0), "values of type bool; they must be real numbers"),
     "pairs": (lambda: PointCloud(seen()[:, :2]), r"have the shape \(\d+, 2\); they must be n x 3"),
     "complex depth": (lambda: DepthImage(np.ones((32, 32)) * 1j, SQUARE), "the depth image has values of type complex"),
     "boolean depth": (
@@ -505,15 +504,12 @@ REFUSED = {
     "a matrix of four": (lambda: Camera.from_K(np.eye(4), 32, 32), "the camera matrix is .*; it must be 3 x 3 numbers"),
     "a column-wise matrix": (lambda: Camera.from_K([40, 0, 0, 0, 40, 0, 16, 16, 1], 32, 32), "0 0 1 in the last row"),
     "depths in a row": (lambda: DepthImage(np.ones(5), SQUARE), r"has the shape \(5,\); it must be rows of pixels"),
-    "depths in layers": (lambda: DepthImage(np.ones((32, 32, 1)), SQUARE), "must be rows of pixels"),
     "another image's mask": (lambda: ONES.to_points(np.ones((3, 4), bool)), r"has the shape \(3, 4\)"),
     "a mask of numbers": (lambda: ONES.to_points(np.ones((32, 32), int)), "type int64; it must be .* mask > 0"),
     "a complex pose": (lambda: load_frame(seen(), camera_pose=np.eye(4) * 1j), "the pose is not of real numbers"),
     "a far pose": (
         lambda: load_frame(seen(), camera_pose=np.eye(4) + np.eye(4, k=3) * 1e300), "translation of 1e.12 at most"
     ),
-    "a ragged pose": (lambda: load_frame(seen(), camera_pose=[[1, 2], [3]]), "the pose is of the shape"),
-    "a pose of words": (lambda: load_frame(seen(), camera_pose=[["a"] * 4] * 4), "is not of real numbers"),
     "labels of other points": (
         lambda: SegmentedCloud(seen(), np.ones(4, np.uint8), np.ones(4), np.ones(4), ("a",), ((0, 0, 0),)),
         "points have 4 labels, 4 confidences and 4 occupancies; each point needs one"

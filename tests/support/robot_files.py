@@ -82,6 +82,26 @@ LAPTOP = """\
 </robot>
 """
 
+LAMP = """\
+<robot name="lamp">
+  <link name="foot"><visual><geometry><box size="0.2 0.14 0.03"/></geometry></visual></link>
+  <link name="arm">
+    <visual><origin xyz="0 0 0.1"/><geometry><box size="0.03 0.05 0.2"/></geometry></visual>
+  </link>
+  <link name="boom">
+    <visual><origin xyz="0 0 0.09"/><geometry><box size="0.05 0.03 0.18"/></geometry></visual>
+  </link>
+  <link name="head"><visual><origin xyz="0.04 0 0.05"/><geometry><box size="0.12 0.07 0.05"/></geometry></visual></link>
+  <joint name="turn" type="revolute"><parent link="foot"/><child link="arm"/><origin xyz="0 0 0.02"/>
+    <axis xyz="0 0 1"/><limit lower="-2.5" upper="2.5" effort="1" velocity="1"/></joint>
+  <joint name="bend" type="revolute"><parent link="arm"/><child link="boom"/><origin xyz="0 0 0.21"/>
+    <axis xyz="0 1 0"/><limit lower="-2.2" upper="2.2" effort="1" velocity="1"/></joint>
+  <joint name="nod" type="revolute"><parent link="boom"/><child link="head"/><origin xyz="0 0 0.19"/>
+    <axis xyz="1 0 0"/><limit lower="-2.2" upper="2.2" effort="1" velocity="1"/></joint>
+</robot>
+"""
+"""Three joints that turn far, in states of which modes have but some."""
+
 LAPTOP_SDF = """\
 <sdf version="1.7"><world name="w"><model name="laptop">
   <frame name="back" attached_to="base"><pose>0 -0.1 0.016 0 0 0</pose></frame>

@@ -113,8 +113,11 @@ class Object:
             raise ValueError(
                 "the method is network, but the object has no weights: name them with --weights, or leave it out"
             )
-        if method not in self._registrars:
-            self._registrars[method] = self._registrar(method)
+        if method not in self._registrars and self.network is not None:
+            self._registrars[method] = registrar_for(self.network, method, self.scene)
+        elif method not in self._registrars:
+            assert self.model is not None
+            self._registrars[method] = Registrar(None, self.model, method, self.scene)
         registrar = self._registrars[method]
         if registrar is None and (self.knows_joints or frame_joints):
             raise ValueError(
@@ -122,12 +125,6 @@ class Object:
                 "out, or take another method"
             )
         return registrar
-
-    def _registrar(self, method: AnswerMethod) -> Registrar | None:
-        if self.network is not None:
-            return registrar_for(self.network, method, self.scene)
-        assert self.model is not None
-        return Registrar(None, self.model, method, self.scene)
 
     @python_words()
     def with_joints(self, joints: object) -> "Object":
@@ -145,10 +142,8 @@ class Object:
             self._narrowed.clear()
             with stage("make the statistical model of the states that the given joints leave"):
                 model = narrowed_model(scene, self.model or kept_model(scene))
-            network: Any = self.network
-            if network is not None:  # weights, which torch has loaded
-                network = replace(network, statistical_model=model)
-            self._narrowed[key] = Object(network, scene, {}, model, self.known_as, True)
+            known: Any = self.network and replace(self.network, statistical_model=model)  # type: ignore[type-var]
+            self._narrowed[key] = Object(known, scene, {}, model, self.known_as, knows_joints=True)
         return self._narrowed[key]
 
     def asking(self, network: Trained | None) -> "Object":
@@ -157,7 +152,7 @@ class Object:
             method: None if registrar is None else registrar.asking(network)
             for method, registrar in self._registrars.items()
         }
-        return Object(network, self.scene, moved, self.model, self.known_as, self.knows_joints)
+        return replace(self, network=network, _registrars=moved, _narrowed={})
 
 
 class WithoutWeightsWarning(UserWarning):

@@ -38,7 +38,7 @@ from mereo.io.cores import limit_blas_threads
 from mereo.models.calibration import Calibration
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
-from mereo.scenes.parameters import known_distances
+from mereo.scenes.parameters import known_distances, model_in
 from mereo.scenes.scene import Scene
 from mereo.scenes.statistical_model import PairDistances, StatisticalModel
 
@@ -90,6 +90,16 @@ class Track:
             other_lines=base.evidence.other_lines,
             area=base.evidence.area,
             calibration=fitted.calibration,
+        )
+
+    def in_model(self, model: StatisticalModel) -> "Track":
+        """The same state, with the velocity of its pose alone, by another model of the same material points."""
+        T, z = model.project(self.problem.model.material(self.posed.z))
+        return replace(
+            self,
+            problem=replace(self.problem, model=model),
+            posed=Posed(self.posed.rotation @ T[:3, :3], self.posed.place(T[:3, 3:].T)[0], z, 0.0),
+            velocity=np.pad(self.velocity[:POSE], (0, model.count)),
         )
 
     def expected(self, time_s: float, config: TrackConfig) -> Posed:
@@ -411,6 +421,9 @@ class Tracker:
         passed_s = time_s - track.time_s
         if not 0 <= passed_s <= longest_s:
             return None, f"it was last followed {passed_s:.1f} s before"
+        model = model_in(frame.scene, self.registrar.model)
+        if model is not track.problem.model:  # values of other joints are known
+            track = track.in_model(model)
         cloud = seen.cloud.transformed(self._T_camera_input)
         points = cloud.points
         keep = np.ones(len(points), dtype=bool) if frame.keep_all else gated(track, points, time_s, self.config)
@@ -419,10 +432,8 @@ class Tracker:
         lines, kept = seen.lines.transformed(self._T_camera_input), cloud.rows(keep)
         near = CloudToFit(kept.points, outliers=points[~keep], lines=lines, normals=kept.normals)
 
-        known = frame.distances(track.problem.model)
-
         def fit(config: TrackConfig) -> _Tracked:
-            fitted, after = next_fit(track, near, time_s, config, known)
+            fitted, after = next_fit(track, near, time_s, config, frame.distances(model))
             return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
         tracked = fit(self.config)
@@ -437,7 +448,7 @@ class Tracker:
             return None
         before = self._T_camera_input, self._axes
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, earlier.seen.frame.axes
-        begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar)
+        begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar.config)
         area = 0.0 if self._track is None else self._track.area
         tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
         if tracked is not None and not self._doubt(tracked):
@@ -457,7 +468,7 @@ class Tracker:
         self._has_begun = True
         if candidate.modes is None:
             return None
-        alone = _Tracked.of_frame(candidate, frame.time_s, config, self.registrar)
+        alone = _Tracked.of_frame(candidate, frame.time_s, config, self.registrar.config)
         if self._doubt(alone):
             return None
         self._track, self._located_by = alone.track, candidate.located_by
@@ -528,12 +539,11 @@ class _Tracked:
     hypothesis: Reading
 
     @classmethod
-    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, registrar: Registrar) -> "_Tracked":
-        """Candidate of a frame that was fitted by itself, maybe with known joints, which the track goes on without."""
+    def of_frame(cls, candidate: Candidate, time_s: float, config: TrackConfig, constants: FitConfig) -> "_Tracked":
+        """Candidate of a frame that was fitted by itself."""
         assert candidate.modes is not None
         fitted = replace(candidate.modes, rest=None)
-        track = Track.of(fitted.in_model(registrar.model), time_s, config, registrar.config)
-        return cls(fitted, track, candidate.hypothesis)
+        return cls(fitted, Track.of(fitted, time_s, config, constants), candidate.hypothesis)
 
     @property
     def score(self) -> float:

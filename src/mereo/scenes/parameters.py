@@ -404,6 +404,11 @@ def narrowed_model(scene: Scene, model: StatisticalModel) -> StatisticalModel:
     return replace(made, source_frame=model.source_frame, rests=rests)
 
 
+def model_in(scene: Scene | None, model: StatisticalModel) -> StatisticalModel:
+    """Statistical model of a scene whose joints are all known, which is made at once; of another one ``model``."""
+    return model if scene is None or parameters(random_state(scene, STATES_SEED)) else narrowed_model(scene, model)
+
+
 COMPARED, TRIED = 100, 24
 """Material points between which known joints say distances, and states among which these must not vary."""
 

@@ -105,15 +105,6 @@ class ModesFit:
     calibration: Calibration | None = None
     others: tuple[Float[np.ndarray, "m 3"], ...] = ()
 
-    def in_model(self, model: StatisticalModel) -> "ModesFit":
-        """The same state by another model of the same material points."""
-        before, posed = self.problem.model, self.posed
-        if model is before:
-            return self
-        T, z = model.project(before.material(posed.z))
-        posed = Posed(posed.rotation @ T[:3, :3], posed.place(T[:3, 3:].T)[0], z, posed.log_scale)
-        return replace(self, problem=replace(self.problem, model=model), posed=posed)
-
     @property
     def may_take_draws(self) -> bool:
         """Whether draws may be the answer: besides the rest model only under noise, where modes may miss what moved."""
