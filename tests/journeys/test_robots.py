@@ -326,7 +326,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("message", FAULTS)
 def test_a_bad_file_is_one_sentence(message: str, tmp_path: Path) -> None:
-    path = tmp_path / "laptop.urdf"
+    path = tmp_path / ("laptop.urdf.xacro" if message == "macro file" else "laptop.urdf")
     path.write_text(LAPTOP.replace(*FAULTS[message]))
     with pytest.raises((ValueError, FileNotFoundError), match=re.escape(message)) as error:
         mereo.load_object(path)

@@ -29,8 +29,8 @@ from mereo.io.errors import AnyPath, readable
 from mereo.io.extras import library
 from mereo.io.mesh_formats import read_object_mesh
 
-ROBOT_SUFFIXES = (".urdf", ".sdf", ".xml")
-"""Suffixes of files of robots, whose links are meshes."""
+ROBOT_SUFFIXES = (".urdf", ".sdf", ".xml", ".xacro")
+"""Suffixes of files of robots, whose links are meshes; of macro files it is said what to do."""
 
 HEAD_BYTES = 4096
 """Bytes at the beginning of an XML file, comments before its first element included, that say whether it is MJCF."""
@@ -119,7 +119,7 @@ def read_robot(path: AnyPath, robot_meshes: RobotMeshes = "visual") -> Robot:
         parser = etree.XMLParser(resolve_entities=False, remove_comments=True, remove_pis=True)
         root = etree.parse(BytesIO(path.read_bytes()), parser).getroot()
         if any("xacro" in element.tag for element in root.iter(etree.Element)):
-            raise ValueError("it is a macro file, whose links are known once `xacro` has expanded it")
+            raise ValueError("it is a macro file: expand it by `xacro FILE > robot.urdf`, and name that")
         if kind == "MJCF":
             return _assembled(_read_mjcf(path, yourdfpy, library("mujoco", "simulation", path), robot_meshes))
         if kind == "URDF":

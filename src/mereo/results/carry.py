@@ -182,8 +182,8 @@ def _placed(attachment: Attachment, T_scene_file: Transform, model: StatisticalM
         raise ValueError(
             f"{name}: {far} of {len(distance)} points are farther from the object than it is long (the median one "
             f"{np.median(distance):.4g} scene units, its length is {size:.4g}); they must lie in or near the object: "
-            "bring it to the frame and unit of the object's own files, or say --carry-frame scene if it is in scene "
-            "units"
+            "bring them to the frame and unit of the object's own files, or say --carry-frame scene if they are in "
+            "scene units"
         )
     if isinstance(content, Surfaces):  # with longer edges a plane could not bend
         parts = content.mesh.segments
