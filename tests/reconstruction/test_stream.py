@@ -290,7 +290,7 @@ def run(monkeypatch: pytest.MonkeyPatch, surfaces: Path, frames: Names, *more: s
     """Exit code of a stream in which every frame is answered with the same surfaces."""
     answered = FrameAnswer(segments(), {})
     outcomes = [Outcome(name, 0.0, answered, "", 0.1, 0.1, 0) for name in frames]
-    nothing = SimpleNamespace(network=None, registrar=lambda _: None)
+    nothing = SimpleNamespace(network=None, registrar=lambda *_: None)
     monkeypatch.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
     monkeypatch.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
     monkeypatch.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(outcomes))

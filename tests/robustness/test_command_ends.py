@@ -129,7 +129,7 @@ def test_what_is_ignored_stays_ignored() -> None:
 def test_a_stream_sums_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
     (tmp_path / "a.npy").touch()
     with monkeypatch.context() as patched:
-        nothing = SimpleNamespace(network=None, registrar=lambda _: None)
+        nothing = SimpleNamespace(network=None, registrar=lambda *_: None)
         patched.setattr("mereo.cli.stream.loaded_object", lambda *_: nothing)
         patched.setattr("mereo.cli.stream.Answering", lambda *_: SimpleNamespace(close=lambda: None))
         patched.setattr("mereo.cli.stream.stream", lambda *_, **__: iter(lambda: os.kill(os.getpid(), STOPPING[0]), 1))
