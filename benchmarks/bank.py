@@ -159,8 +159,8 @@ def recording() -> Iterator[Recorder]:
         recorder.unit = unit
         return evidence(cloud, unit, *most)
 
-    def recorded_descent(problem: Any, fit: Any, fresh: int, motion: Any = None) -> Any:
-        drawn = descend(problem, fit, fresh, motion)
+    def recorded_descent(problem: Any, fit: Any, fresh: int) -> Any:
+        drawn = descend(problem, fit, fresh)
         stage = "draws settled" if stage_of_caller() == "settled" else "draws"
         recorder.add(stage, problem.base, drawn.posed, drawn.surface, Misfit(np.nan, drawn.misfit))
         return drawn

@@ -58,16 +58,14 @@ class DrawsConfig:
 
     Attributes:
         starts: random states, most like a shape, from which fits start.
-        sieve: sets of differences spent on each start, and on how many of the best, one stage after the other.
-        kept: how many of them are then fitted to the frame.
+        sieve: how many of the best of these approach the shape, one stage after the other.
         cloud_weight: how many independent points the cloud is worth, also where draws and modes are compared.
         last_rounds: sets of differences in the fit to the frame.
         steps: at most with one set of differences.
     """
 
     starts: int = 40
-    kept: int = 2
-    sieve: tuple[tuple[int, int], ...] = ((1, 10), (1, 3))
+    sieve: tuple[int, ...] = (10, 2)
     cloud_weight: float = 1500.0
     last_rounds: int = 2
     steps: int = 6

@@ -289,21 +289,15 @@ def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.nd
     return StateOnShape(drawn, z, points, rotation, translation, apart + float(z @ z))
 
 
-def approach(states: DrawnStates, shape: Shape, state: StateOnShape, fresh: int) -> StateOnShape:
-    """Approach the shape from a state, by ``fresh`` sets of differences."""
-    damping = 0.1
-    for _ in range(fresh):
-        motion = derivatives(states, state.drawn, state.z, state.points)
-        before = state.misfit
-        for _ in range(6):
-            nearer, motion, damping = _step(states, shape, state, motion, damping)
-            gain, state = state.misfit - nearer.misfit, nearer
-            if gain < ENOUGH * state.misfit:
-                break
-        state = replace(state, motion=motion)
-        if before - state.misfit < 2 * ENOUGH * before:
+def approach(states: DrawnStates, shape: Shape, state: StateOnShape) -> StateOnShape:
+    """Approach the shape from a state, by one set of differences."""
+    motion, damping = derivatives(states, state.drawn, state.z, state.points), 0.1
+    for _ in range(6):
+        nearer, motion, damping = _step(states, shape, state, motion, damping)
+        gain, state = state.misfit - nearer.misfit, nearer
+        if gain < ENOUGH * state.misfit:
             break
-    return state
+    return replace(state, motion=motion)
 
 
 def _step(
@@ -334,12 +328,29 @@ GAIN = 0.003
 
 
 def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
-    """Fit the draws from states like a fit of the modes; None where the scene plays none of them back."""
+    """Fit the draws from a state like a fit of the modes; None where the scene plays none of them back."""
+    start = start_near(problem, modes)
+    return None if start is None else refine_by_sight(problem, descend(problem, start, problem.config.last_rounds))
+
+
+def start_near(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
+    """State of the scene that is like a fit of the modes, and explains the frame best; None without any.
+
+    The states most like it approach its shape, ever fewer of them.
+    """
     states, shape = problem.states, Shape.of_material(problem, problem.model.material(modes.z))
     guess = states.guess(modes.z, problem.model.motion)
-    starts = (lay_on_shape(states, shape, start, start.z) for start in (*similar_states(problem, shape), guess))
-    fits = descend_best(problem, modes, shape, [start for start in starts if start is not None])
-    return refine_by_sight(problem, min(fits, key=by_misfit)) if fits else None
+    laid = (lay_on_shape(states, shape, start, start.z) for start in (*similar_states(problem, shape), guess))
+    starts = [state for state in laid if state is not None]
+    for keep in problem.config.sieve:
+        starts = [approach(states, shape, start) for start in sorted(starts, key=by_misfit)[:keep]]
+    fits = list[DrawsFit]()
+    for start in starts:
+        translation = modes.place(start.translation[None])[0]
+        posed = Posed(modes.rotation @ start.rotation, translation, np.empty(0), modes.log_scale)
+        fit = simulate(problem, start.drawn, start.z, posed)
+        fits += [] if fit is None else [replace(fit, motion=start.motion)]
+    return min(fits, key=by_misfit, default=None)
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
@@ -371,22 +382,6 @@ def settled(problem: DrawsProblem, fit: DrawsFit) -> tuple[DrawsProblem, DrawsFi
     return replace(worth, base=fit.base), fit
 
 
-def descend_best(problem: DrawsProblem, frame: Posed, shape: Shape, starts: list[StateOnShape]) -> list[DrawsFit]:
-    """Descend from the best of some starts."""
-    config, states = problem.config, problem.states
-    for fresh, keep in config.sieve:
-        starts = [approach(states, shape, start, fresh) for start in sorted(starts, key=by_misfit)[:keep]]
-    fits = []
-    for start in starts:
-        translation = frame.place(start.translation[None])[0]
-        posed = Posed(frame.rotation @ start.rotation, translation, np.empty(0), frame.log_scale)
-        fit = simulate(problem, start.drawn, start.z, posed)
-        if fit is not None:
-            fits.append((fit, start.motion))
-    best = sorted(fits, key=lambda pair: pair[0].misfit)[: config.kept]
-    return [descend(problem, fit, config.last_rounds, motion) for fit, motion in best]
-
-
 def similar_states(problem: DrawsProblem, shape: Shape) -> list[Drawn]:
     """Random states most like a shape."""
     states = problem.states
@@ -402,11 +397,9 @@ def first_sigma(problem: DrawsProblem) -> float:
     return max(0.03 * problem.model.half, problem.base.cloud_sigma)
 
 
-def descend(
-    problem: DrawsProblem, fit: DrawsFit, fresh: int, motion: Float32[np.ndarray, "a 3 d"] | None = None
-) -> DrawsFit:
-    """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after the given one."""
-    config, least = problem.config, problem.base.cloud_sigma
+def descend(problem: DrawsProblem, fit: DrawsFit, fresh: int) -> DrawsFit:
+    """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after one that is there."""
+    config, least, motion = problem.config, problem.base.cloud_sigma, fit.motion
     index, sigma, damping = problem.states.played.index, first_sigma(problem), 0.03
     for number in range(fresh + (motion is not None)):
         if number or motion is None:
