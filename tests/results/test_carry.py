@@ -549,13 +549,3 @@ def test_the_command_refuses_before_any_work(
 ) -> None:
     assert run(folder, ("grasp.csv",), *options, cloud="no-such-cloud.npy", output="refused") != 0
     assert message in " ".join(capsys.readouterr().err.split()) and not (folder / "refused").exists()
-
-
-@pytest.mark.slow
-def test_without_a_registration_nothing_is_written(
-    folder: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(Registrar, "takes", lambda *_: False)  # as of a frame that no state explains
-    assert run(folder, ("grasp.csv",), output="none") != 0
-    assert "the network's answer is kept, but --carry needs a registration" in capsys.readouterr().err
-    assert not (folder / "none").exists()
