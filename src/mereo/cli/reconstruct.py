@@ -429,7 +429,8 @@ def written(output: AnyPath, seconds: float) -> str:
 def print_source(answer: Answer) -> None:
     """Print where an answer comes from, and whether it can be believed."""
     registration = answer.registration
-    assert registration is not None
+    if registration is None:
+        return
     ways = {"search": "; found by search", "pose": "; from the initial pose"}
     by = ways.get(answer.located_by, "")
     print(f"the registered model explains {registration.explained:.1%} of the cloud ({registration.method}{by})")
