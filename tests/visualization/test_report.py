@@ -211,6 +211,7 @@ def recognized(known: bool | str, reason: str | None = None) -> Recognition:
         (recognized("unsure", "3% are not: look, or crop"), FIT, "doubt", "Doubtful: 3% are not.", "look, or crop"),
         (recognized(False, "size: unit (-u: m)"), FIT, "no", "Do not trust it: size.", "unit (-u: m)"),
         (recognized(False), FIT, "no", "Do not trust it: it was not recognized.", None),
+        (recognized(True), {**FIT, "accepted": False}, "doubt", "Doubtful: it was not recognized.", None),
         (Recognition(False, "the object is lost", MOST), None, "no", "Do not trust it: the object is lost.", None),
         (NOT_EVALUATED, None, "alone", NOTHING, None),
         (None, None, "alone", NOTHING, None),

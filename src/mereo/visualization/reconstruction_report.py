@@ -247,9 +247,9 @@ def trust(summary: Facts) -> Trust:
     Args:
         summary: its ``recognition`` and ``registration`` are read.
     """
-    recognition = _block(summary, "recognition")
-    known, explained = recognition.get("known"), _number(_block(summary, "registration").get("explained"))
-    if known is True and explained is not None:
+    recognition, registration = _block(summary, "recognition"), _block(summary, "registration")
+    known, explained = recognition.get("known"), _number(registration.get("explained"))
+    if known is True and explained is not None and registration.get("accepted") is not False:
         share = f"{100 * explained:.1f}\N{NO-BREAK SPACE}% of the points"
         return Trust("yes", f"the frame shows the object; the model explains {share}")
     if known is not False and not recognition.get("signs"):

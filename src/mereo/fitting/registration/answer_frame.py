@@ -154,10 +154,11 @@ def search_hypotheses(seen: Observation, registrar: Registrar, keep_all: bool, s
 
     Takes the arguments of ``answer_frame``, and raises as it does.
     """
+    unit = scene_unit_of(seen, registrar, scene_unit)
     candidates, refusals = list[Candidate](), list[NoFit]()
     for reading in seen.readings(keep_all):
         try:
-            candidates.append(_searched(reading, registrar, scene_unit_of(seen, registrar, scene_unit), seen))
+            candidates.append(_searched(reading, registrar, unit, seen))
         except NoFit as error:
             refusals.append(error)
         if candidates and candidates[-1].is_accepted:
