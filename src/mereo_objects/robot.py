@@ -30,41 +30,40 @@ which finger is which; the fingers are two pixels thick and often hidden; the de
 where the column hides the hand.
 """
 
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from mereo.deformation.draw_names import named, unchecked
-from mereo.deformation.maps import Compose, Deformation, Identity, Rigid
+from mereo.deformation.draw_names import part, unchecked
+from mereo.deformation.maps import Compose, Deformation, Rigid
+from mereo.deformation.samplers import JointSampler, RandomMotion
+from mereo.geometry.conventions import Names
 from mereo.geometry.mesh import PALETTE, SegmentedMesh
 from mereo.geometry.read_only import read_only
 from mereo.scenes.scene import GUESSED_UNIT_M, Scene, Workspace
 from mereo_objects import _robot_parts as parts
 from mereo_objects._solids import Vector, segment
 
+MOVED = "column", "upper_arm", "elbow", "forearm", "wrist", "hand", "finger_left", "finger_right"
+"""Segments that move, in the order of the chain."""
 
-class ArmJoint(NamedTuple):
-    """Revolute joint of the rest pose: a point of its axis, the axis, and limits in degrees.
 
-    It is called after the segment that it moves.
-    """
-
-    name: str
-    center: Vector
-    axis: Vector
-    lower_deg: float
-    upper_deg: float
+def _turn(name: str, center: Vector, axis: Vector, lower_deg: float, upper_deg: float) -> JointSampler:
+    """Revolute joint of the rest pose, called after the segment that it moves."""
+    limits = float(np.deg2rad(lower_deg)), float(np.deg2rad(upper_deg))
+    return JointSampler(np.array(center), np.array(axis), limits, (0.0, 0.0), np.zeros(3), name)
 
 
 JOINTS = (
-    ArmJoint("column turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
-    ArmJoint("upper arm lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
-    ArmJoint("elbow fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
-    ArmJoint("forearm roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
-    ArmJoint("wrist pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
-    ArmJoint("hand spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    _turn("column turn", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0), -170.0, 170.0),
+    _turn("upper arm lean", parts.SHOULDER, (0.0, 1.0, 0.0), -50.0, 75.0),
+    _turn("elbow fold", parts.ELBOW, (0.0, 1.0, 0.0), -45.0, 75.0),
+    _turn("forearm roll", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
+    _turn("wrist pitch", parts.WRIST, (0.0, 1.0, 0.0), -100.0, 100.0),
+    _turn("hand spin", parts.WRIST, (1.0, 0.0, 0.0), -180.0, 180.0),
 )
 OPENING = (0.15, 2.0)
 """Least and largest distance of a finger from the middle."""
@@ -124,21 +123,6 @@ def rest_mesh() -> SegmentedMesh:
     return SegmentedMesh(tuple(segment(name, PALETTE[i], part) for i, (name, part) in enumerate(solids.items())))
 
 
-def sample_angles(rng: np.random.Generator) -> Float[np.ndarray, "6"]:
-    """Random joint angles in radians, uniform within the limits."""
-    limits = np.array([(joint.lower_deg, joint.upper_deg) for joint in JOINTS])
-    names = tuple(joint.name for joint in JOINTS)
-    return np.deg2rad(named(rng, names, "°").uniform(limits[:, 0], limits[:, 1]))
-
-
-def chain(angles_rad: Float[np.ndarray, "6"]) -> tuple[Rigid, ...]:
-    """Turns of the joints, in the rest frame; link k moves by the first k of them, the last one first."""
-    return tuple(
-        Rigid(angle * np.array(joint.axis), np.zeros(3), np.array(joint.center))
-        for joint, angle in zip(JOINTS, angles_rad, strict=True)
-    )
-
-
 def is_clear(turns: tuple[Rigid, ...]) -> bool:
     """Whether the moving parts keep off the floor, the base, the column and the upper arm.
 
@@ -162,20 +146,46 @@ def _moved(bulk: Bulk, turns: tuple[Rigid, ...]) -> Float[np.ndarray, "n 3"]:
     return Compose(turns[: bulk.link][::-1])(bulk.centers())
 
 
-def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
-    """Motions of all segments at random angles of all joints and a random opening; the base stays."""
-    while True:  # one line draws, so that a recorder knows refused angles for what they are
-        turns = chain(sample_angles(rng))
-        if unchecked(rng) or is_clear(turns):
-            break
-    links = [Compose(turns[:count][::-1]) for count in range(1, len(turns) + 1)]
-    opening = named(rng, "fingers apart").uniform(*OPENING)
-    slide = np.array([0.0, opening - parts.JAW_OPENING, 0.0])
-    fingers = [Compose((Rigid(np.zeros(3), side * slide, np.zeros(3)), *turns[::-1])) for side in (1, -1)]
-    return (Identity(), *links, *fingers)
+def _finger(name: str, side: float, follows: str = "") -> JointSampler:
+    """Slide of a finger, on a side."""
+    limits = side * (OPENING[0] - parts.JAW_OPENING), side * (OPENING[1] - parts.JAW_OPENING)
+    return JointSampler(np.zeros(3), np.array([0.0, 1.0, 0.0]), (0.0, 0.0), limits, np.zeros(3), name, follows)
+
+
+@dataclass(frozen=True, eq=False)
+class ArmMotion(RandomMotion):
+    """Random angles of all joints at which the parts keep apart, and a random opening; the base stays."""
+
+    @property
+    def leaders(self) -> Names:
+        """Joints in the order in which they are drawn."""
+        return (*(joint.name for joint in JOINTS), "fingers apart")
+
+    def __call__(self, rng: np.random.Generator) -> tuple[Deformation, ...]:
+        """Motions of all segments."""
+        shares = dict[str, float]()
+        while True:
+            for name in self.leaders[:-1]:
+                with part(rng, name):
+                    shares[name] = self.joints[name][0].sample_share(rng)
+            if unchecked(rng) or is_clear(tuple(self.joints[name][0].at(share) for name, share in shares.items())):
+                break
+        with part(rng, self.leaders[-1]):
+            shares[self.leaders[-1]] = self.joints[self.leaders[-1]][0].sample_share(rng)
+        return self.at(shares)
+
+
+def motion() -> ArmMotion:
+    """Motion of the arm: of the fingers first, as the tip of a chain moves first."""
+    rest = rest_mesh()
+    number = {name: rest.names.index(name) for name in MOVED}
+    moved = [tuple(number[name] for name in MOVED[first:]) for first in range(len(JOINTS))]
+    left, right = (number["finger_left"],), (number["finger_right"],)
+    fingers = ((_finger("fingers apart", 1.0), left), (_finger("other finger", -1.0, "fingers apart"), right))
+    return ArmMotion(rest, (*fingers, *reversed(tuple(zip(JOINTS, moved, strict=True)))))
 
 
 def scene() -> Scene:
     """Scene of the arm; the paper's camera workspace above it."""
     workspace = Workspace(fov_rad=float(np.deg2rad(44.0)))
-    return Scene("robot", rest_mesh(), sample_deformations, workspace, unit_m=GUESSED_UNIT_M)
+    return Scene("robot", rest_mesh(), motion(), workspace, unit_m=GUESSED_UNIT_M)

@@ -146,9 +146,9 @@ def test_noise_is_told_from_a_wrong_state(
     """Also that of a stereo camera that matches windows, after the last round: each patch is off by one amount."""
     rounds, go_on = list[SearchRound](), Trail.go_on
 
-    def counted(trail: Trail, stage: SearchRound) -> None:
+    def counted(trail: Trail, stage: SearchRound, poses: list[Posed]) -> None:
         rounds.append(stage)
-        go_on(trail, stage)
+        go_on(trail, stage, poses)
 
     monkeypatch.setattr(Trail, "go_on", counted)
     posed = state(model, 1)

@@ -670,6 +670,33 @@ def test_a_lamp_whose_joints_are_known_is_followed_without_bending(working_folde
     assert_kinematics(Path("lamp.urdf"), result, "head", "foot")
 
 
+def test_a_lamp_of_which_nothing_is_known_is_followed_without_bending(working_folder: Path) -> None:
+    Path("lamp.urdf").write_text(LAMP)
+    lamp = mereo.load_object("lamp.urdf")
+    with mereo.Tracker(lamp) as tracker:
+        for step in range(4):
+            true = write_frame(Path("frame.ply"), lamp.scene, [0.2 + 0.02 * step, 0.7, 0.4 + 0.02 * step], 5)
+            result = tracker.follow("frame.ply", 0.1 * step, unit_m=1.0)
+            values = [joint.value for joint in result.joints.values()]
+            assert result.known is True and np.rad2deg(np.abs(np.subtract(values, true))).max() < 1.0
+            for joint, value in zip(result.joints.values(), true, strict=True):
+                assert joint.interval[0] < value < joint.interval[1]
+    assert result.tracking == "followed"
+    assert_kinematics(Path("lamp.urdf"), result, "head", "foot")
+
+
+def test_a_pose_that_is_given_leaves_the_joints_to_be_looked_for(working_folder: Path) -> None:
+    Path("lamp.urdf").write_text(LAMP)
+    lamp = mereo.load_object("lamp.urdf")
+    true = write_frame(Path("frame.ply"), lamp.scene, [0.3, 0.75, 0.3], 5)
+    pose = mereo.reconstruct("frame.ply", lamp, unit_m=1.0).pose
+    pose[:3, 3] += 0.01
+    result = mereo.reconstruct("frame.ply", lamp, unit_m=1.0, initial_pose=pose)
+    assert result.located_by == "pose" and result.known is True
+    values = [joint.value for joint in result.joints.values()]
+    assert np.rad2deg(np.abs(np.subtract(values, true))).max() < 1.0
+
+
 def test_a_stream_reads_the_joints_of_each_frame_from_a_folder_or_a_recording(
     known: mereo.Object, gripper: Path, working_folder: Path, capsys: pytest.CaptureFixture
 ) -> None:

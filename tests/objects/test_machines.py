@@ -96,9 +96,10 @@ def states() -> list[State]:
 
 
 def pose(*angles_deg: float) -> SegmentedMesh:
-    turns = robot.chain(np.deg2rad(np.array(angles_deg)))
-    links = [robot.Compose(turns[:count][::-1]) for count in range(1, 7)]
-    return robot.scene().deform((robot.Identity(), *links, links[-1], links[-1])).mesh
+    shares = {joint.name: joint.share(angle) for joint, angle in zip(robot.JOINTS, np.deg2rad(angles_deg), strict=True)}
+    motion = robot.motion()
+    shares["fingers apart"] = motion.joints["fingers apart"][0].share(0.0)
+    return robot.scene().deform(motion.at(shares)).mesh
 
 
 def test_neighbours_have_a_clearance() -> None:
@@ -111,7 +112,7 @@ def test_neighbours_have_a_clearance() -> None:
 def test_neighbours_pass_each_other_at_any_angle(index: int, share: float) -> None:
     joint = robot.JOINTS[index]
     angles = np.zeros(6)
-    angles[index] = joint.lower_deg + share * (joint.upper_deg - joint.lower_deg)
+    angles[index] = np.rad2deg(joint.limits[0] + share * (joint.limits[1] - joint.limits[0]))
     angles[5] = 45.0  # the hand's corners turned up
     mesh = pose(*angles)
     assert all(pair not in overlapping_pairs(mesh) for pair in pairwise(LINKS))
@@ -121,7 +122,7 @@ def test_neighbours_share_the_axis_of_their_joint_above_the_floor(states: list[S
     for state in states:
         assert state.mesh.bounds[0, 2] > -1e-9
         for joint, (before, after) in zip(robot.JOINTS, pairwise(state.deformations[:7]), strict=True):
-            on_axis = np.array(joint.center) + np.outer([0.0, 3.0], joint.axis)
+            on_axis = joint.pivot + np.outer([0.0, 3.0], joint.axis)
             assert np.allclose(before(on_axis), after(on_axis), atol=1e-9)
 
 
@@ -150,7 +151,8 @@ def test_fingers_open_alike_and_stay_on_their_guides(states: list[State]) -> Non
 )
 def test_poses_in_which_parts_meet_are_refused(angles_deg: tuple[float, ...], pair: tuple[str, str]) -> None:
     assert pair in overlapping_pairs(pose(*angles_deg))
-    assert not robot.is_clear(robot.chain(np.deg2rad(np.array(angles_deg))))
+    turns = (joint.at(joint.share(angle)) for joint, angle in zip(robot.JOINTS, np.deg2rad(angles_deg), strict=True))
+    assert not robot.is_clear(tuple(turns))
 
 
 # --- lizard -----------------------------------------------------------------------------------------------------------

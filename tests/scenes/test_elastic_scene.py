@@ -19,7 +19,7 @@ from mereo.fitting.problem.evidence import Directions, Evidence, signed
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import GivenPose, Problem
 from mereo.fitting.problem.residuals import Prior, SampledSurface
-from mereo.fitting.registration.answer_frame import initial_state, search_modes
+from mereo.fitting.registration.answer_frame import initial_states, search_modes
 from mereo.fitting.registration.register import CloudToFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.transforms import rigid, transform_points
@@ -244,7 +244,7 @@ def test_a_given_pose_starts_the_fit_and_holds_what_is_held(held: tuple[Scene, S
     T = IN_FRONT @ world
     cloud, true = seen(state.mesh.transformed(T)), transform_points(T, true)
     T_files = rigid(IN_FRONT[:3, :3], transform_points(IN_FRONT, scene.source_frame.T_scene_source[:3, 3]))
-    start = initial_state(T_files, model, 1.0)
+    (start,) = initial_states(T_files, model, 1.0)
     assert_allclose(start.place(model.mean), transform_points(IN_FRONT, model.mean), atol=1e-6)
     wrong = Posed(Rotation.from_rotvec([0.0, 0.0, 0.02]).as_matrix() @ start.rotation, start.translation, start.z)
     fitted = search_modes(CloudToFit(cloud, 1.0), model, ELASTIC, [wrong])

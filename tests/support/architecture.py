@@ -124,13 +124,13 @@ MAY_IMPORT = {"torch": ("models/", "cli/tools.py"), "matplotlib": ("io/extras.py
 """The same of libraries that most installations lack: asked for where they are used, with the extra's name."""
 
 BUDGET = {
-    "src/mereo": (304_000, 162),
+    "src/mereo": (308_700, 163),
     "src/mereo_learning": (46_220, 22),
-    "src/mereo_objects": (40_000, 28),
+    "src/mereo_objects": (40_150, 28),
     "src/mereo_serving": (10_640, 13),
     "src/mereo_viewer": (12_030, 5),
     "src/mereo_experiments": (11_230, 16),
-    "tests": (294_600, 138),
+    "tests": (295_800, 139),
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 

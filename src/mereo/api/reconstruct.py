@@ -42,7 +42,7 @@ from mereo.reconstruction.observation import (
     find_object,
     size_warning,
 )
-from mereo.scenes.parameters import with_joints
+from mereo.scenes.parameters import with_frame_joints
 from mereo.synthesis.sample_views import shipped_frame, shipped_frames
 
 Isolation = IsolationConfig | Mapping[str, Any] | None
@@ -385,7 +385,7 @@ class Tracker:
             seen = observation_of(frame, isolation, reading)
             if self._initial_pose is not None:
                 seen = replace(seen, initial_pose=self._initial_pose)
-            scene = None if joints is None else with_joints(self._scene, joints)
+            scene = None if joints is None else with_frame_joints(self._scene, joints)
             answer = self._tracker.follow(seen, time_s, keep_all=isolation.keep_all, scene=scene)
         self._initial_pose = None
         return Result.of(answer)

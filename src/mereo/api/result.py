@@ -729,7 +729,7 @@ class StoredResult(SegmentedResult):
             raise ValueError(NO_MODEL)
         registrar = self.object.registrar("modes")
         assert registrar is not None
-        registration = restored(self.state, registrar.model, self.object.scene)
+        registration = restored(self.state, registrar.model.registered, self.object.scene)
         return registrar, registration.moved(inverse_rigid(np.array(self.state.T_camera_input))), self.frame
 
     def _results(self, files: FilesConfig) -> Results:

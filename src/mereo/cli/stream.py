@@ -51,7 +51,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.config import IsolationConfig
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.results.joints import measure_joints, segment_poses
-from mereo.scenes.parameters import with_joints
+from mereo.scenes.parameters import with_frame_joints
 from mereo.synthesis.recording import CAMERA, FRAMES, is_recording_folder
 
 STANDARD_INPUT = "-"
@@ -567,7 +567,7 @@ class Answering:
         if self.tracker is None:
             answer = answer_frame(at_point(seen, None), self.model, None, keep_all=self.keep_all)
         else:
-            scene = None if frame.joints is None else with_joints(self.scene, frame.joints())
+            scene = None if frame.joints is None else with_frame_joints(self.scene, frame.joints())
             answer = self.tracker.follow(seen, frame.time_s, keep_all=self.keep_all, scene=scene)
         return FrameAnswer.of(replace(answer, resolution=self.resolution), self.uncertainty, self.radius)
 

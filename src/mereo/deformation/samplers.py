@@ -21,7 +21,7 @@ from numpy.random import Generator
 from mereo.deformation.draw_names import named, part
 from mereo.deformation.maps import Compose, Deformation, Deformations, Localized, Rigid, unit
 from mereo.deformation.warps import Bend, FreeFormLattice, SmoothField, Squash, Taper, Twist
-from mereo.geometry.conventions import GridShape, Range, WholeNumbers
+from mereo.geometry.conventions import GridShape, Names, Range, WholeNumbers
 from mereo.geometry.mesh import SegmentedMesh, vertex_normals
 from mereo.geometry.transforms import AnyPoints, Corners, Points, Vector
 
@@ -236,6 +236,11 @@ class RandomMotion:
         """Joints with a name, by it, and indices of the segments that each moves; in the order of the steps."""
         joints = ((sampler, members) for sampler, members in self.steps if isinstance(sampler, JointSampler))
         return {sampler.name: (sampler, members) for sampler, members in joints if sampler.name}
+
+    @property
+    def leaders(self) -> Names:
+        """Joints with a name that follow no other one, in the order in which they are drawn."""
+        return tuple(dict.fromkeys(joint.follows or joint.name for joint, _ in self.joints.values()))
 
     def narrowed(self, shares: Mapping[str, Range]) -> "RandomMotion":
         """The same where joints that follow no other one have but these shares of their ranges, by their names."""

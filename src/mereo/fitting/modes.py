@@ -173,9 +173,6 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
 
 # --- states of the library from which a fit may start -----------------------------------------------------------------
 
-SEARCHED, FEWER = 700, 64
-"""States of the library that are compared, and material points that rank them."""
-
 ALIKE = 0.03
 """Tolerance, of half the rest box's longest side: points nearer than this agree."""
 
@@ -209,10 +206,9 @@ def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
     model = problem.model
     goal = model.material(posed.z)[model.sparse].astype(np.float32)
     equal = np.ones(len(goal), dtype=np.float32)
-    step = max(1, len(model.library) // SEARCHED)
-    few = model.sparse_library[::step, :FEWER]
-    alike = step * np.argsort(robust_poses(few, goal[:FEWER], equal[:FEWER], ALIKE * model.half)[0])[:80]
-    _, rotation, translation = robust_poses(model.sparse_library[alike], goal, equal, ALIKE * model.half)
+    cost, rotation, translation = robust_poses(model.sparse_library, goal, equal, ALIKE * model.half)
+    alike = np.argsort(cost)[:80]
+    rotation, translation = rotation[alike], translation[alike]
     shapes = np.matmul(model.sparse_library[alike], rotation.transpose(0, 2, 1)) + translation[:, None]
     shapes = shapes.reshape(len(alike), -1)
     chosen = [0, *different(shapes, shapes[0], min(count, len(shapes)) - 1)]

@@ -8,6 +8,8 @@
 3. The best of these are fitted as a frame always is, as long as they may be better or as good.
 4. Where the frame is not explained, the same again from other states of the library.
 
+Poses of a mechanism bend in the first step, from several states, and states near the best of them are tried too.
+
 States that are known or guessed, as by a network, are fitted before.
 """
 
@@ -15,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import permutations
+from itertools import cycle, permutations
 from operator import attrgetter
 from typing import Any, NamedTuple
 
@@ -26,6 +28,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
+from mereo.fitting.modes import ALIKE as AGREES
 from mereo.fitting.modes import (
     BENT_APART,
     ScoredFit,
@@ -35,16 +38,18 @@ from mereo.fitting.modes import (
     fit_cloud,
     fit_wide,
     refined,
+    robust_poses,
     settled_once,
     shaken,
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem, is_normal, noise_of
-from mereo.fitting.problem.residuals import ROBUST, Prior, SampledSurface
+from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, SampledSurface
 from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
+from mereo.scenes.mechanism import Mechanism
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 # --- tables of shapes -------------------------------------------------------------------------------------------------
@@ -63,6 +68,9 @@ def clipped(position: Float32[np.ndarray, "n w d"], count: int) -> Int32[np.ndar
 CELLS = 32
 """Cells along each side of a table."""
 
+APART = 0.15
+"""Distance between two poses' samples, as a share of the half length, up to which they are one."""
+
 
 @dataclass(frozen=True, eq=False)
 class ShapeTables:
@@ -80,22 +88,153 @@ class ShapeTables:
     cell: Float32[np.ndarray, " q"]
     nearest: Int32[np.ndarray, "q c"]
 
+    apart = APART
+
     @classmethod
     def of(cls, model: StatisticalModel, z: Float32[np.ndarray, "q k"], surface: SampledSurface) -> "ShapeTables":
         """Tables of states with the coefficients ``z``."""
-        flat = z @ surface.modes.reshape(surface.mean.size, model.count).T
-        frame = surface.mean + flat.reshape(len(z), *surface.mean.shape)
-        position = np.ascontiguousarray(frame[:, :, 0])
+        frame = np.stack([surface.frames(each) for each in z])
         normal = cross(frame[:, :, 1].reshape(-1, 3), frame[:, :, 2].reshape(-1, 3))
-        normal = unit_rows(normal)
-        margin = np.float32(0.5 * model.half)  # beyond, all points are outliers
+        states = cls.tabulate(z, frame[:, :, 0], unit_rows(normal).reshape(frame[:, :, 0].shape), model.half)
+        return MechanismTables.of_joints(states, surface) if isinstance(surface, SampledMechanism) else states
+
+    @classmethod
+    def tabulate(
+        cls,
+        z: Float32[np.ndarray, "q k"],
+        position: Float32[np.ndarray, "q s 3"],
+        normal: Float32[np.ndarray, "q s 3"],
+        half: float,
+    ) -> "ShapeTables":
+        """Tables of samples, of an object of this half length."""
+        position, margin = np.ascontiguousarray(position), np.float32(0.5 * half)  # beyond, all points are outliers
         low, high = position.min(axis=1) - margin, position.max(axis=1) + margin
         cell = (high - low).max(axis=1) / CELLS
         low = (low + high - CELLS * cell[:, None]) / 2
         steps = np.stack(np.meshgrid(*(np.arange(CELLS, dtype=np.float32) + 0.5,) * 3, indexing="ij"), axis=-1)
         trees = (cKDTree(samples, balanced_tree=False, compact_nodes=False) for samples in position)
         nearest = [tree.query(low[i] + cell[i] * steps.reshape(-1, 3))[1] for i, tree in enumerate(trees)]
-        return cls(z, position, normal.reshape(position.shape), low, cell, np.stack(nearest).astype(np.int32))
+        return cls(z, position, normal, low, cell, np.stack(nearest).astype(np.int32))
+
+    def looked_up(
+        self, state: Int[np.ndarray, "n 1"], points: Float32[np.ndarray, "n p 3"]
+    ) -> Int32[np.ndarray, "n p"]:
+        """Index of the sample of a state near each point of its frame."""
+        index = clipped((points - self.low[state]) / self.cell[state][..., None], CELLS)
+        return self.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
+
+    def near(self, pose: "Poses", count: int, rng: np.random.Generator) -> "Poses":
+        """Poses of states near one: none but itself, where states stay as they are."""
+        return pose
+
+    def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> "Samples":
+        """Samples near points of each pose's model frame."""
+        state = poses.state[:, None]
+        sample = self.looked_up(state, seen)
+        return Samples.still(self.position[state, sample], self.normal[state, sample])
+
+    def few(self, poses: "Poses") -> "Samples":
+        """Samples of each pose's state, evenly spread, as many as points that it is compared with."""
+        step = max(1, self.position.shape[1] // POINTS)
+        return Samples.still(self.position[poses.state, ::step], self.normal[poses.state, ::step])
+
+
+class Samples(NamedTuple):
+    """Samples of states, model frame, and their motion with the numbers of joints."""
+
+    position: Float32[np.ndarray, "n p 3"]
+    normal: Float32[np.ndarray, "n p 3"]
+    motion: Float32[np.ndarray, "n p 3 k"]
+
+    @classmethod
+    def still(cls, position: Float32[np.ndarray, "n p 3"], normal: Float32[np.ndarray, "n p 3"]) -> "Samples":
+        """Samples of states that stay as they are."""
+        return cls(position, normal, np.empty((*position.shape, 0), dtype=np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class MechanismTables(ShapeTables):
+    """Tables of some states of a mechanism, whose poses bend: of each segment at rest too.
+
+    Attributes:
+        mechanism: it.
+        segments: tables of the segments at rest, by their indices; not of those that are too small for a sample.
+        few_at_rest: samples of the whole, evenly spread, at rest: their segments, positions and normals.
+    """
+
+    mechanism: Mechanism
+    segments: Mapping[int, ShapeTables]
+    few_at_rest: tuple[Int[np.ndarray, " w"], Float32[np.ndarray, "w 3"], Float32[np.ndarray, "w 3"]]
+
+    apart = BENT_APART
+
+    @classmethod
+    def of_joints(cls, states: ShapeTables, surface: SampledMechanism) -> "MechanismTables":
+        """Tables of states, and of the segments of samples."""
+        mechanism, none = surface.mechanism, np.zeros((1, 0), dtype=np.float32)
+        position, normal = surface.mean[:, 0], unit_rows(cross(surface.mean[:, 1], surface.mean[:, 2]))
+        parts = {int(owner): surface.owner == owner for owner in np.unique(surface.owner)}
+        segments = {
+            owner: ShapeTables.tabulate(none, position[None, rows], normal[None, rows], mechanism.half)
+            for owner, rows in parts.items()
+        }
+        step = max(1, len(position) // POINTS)
+        return cls(
+            **vars(states),
+            mechanism=mechanism,
+            segments=segments,
+            few_at_rest=(surface.owner[::step], position[::step], normal[::step]),
+        )
+
+    def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> Samples:
+        """Samples near points of each pose's model frame, of the segments that come nearest."""
+        T = self.mechanism.motions(poses.z)[0].astype(np.float32)
+        first, nearest = np.zeros((len(seen), 1), dtype=int), np.full(seen.shape[:2], np.inf, dtype=np.float32)
+        owner, position, normal = np.zeros(seen.shape[:2], dtype=int), np.empty_like(seen), np.empty_like(seen)
+        for number, table in self.segments.items():
+            local = np.matmul(seen - T[:, number, None, :3, 3], T[:, number, :3, :3])
+            sample = table.looked_up(first, local)
+            offset = local - table.position[0, sample]
+            squared = np.einsum("npi,npi->np", offset, offset)
+            rows = squared < nearest
+            nearest[rows], owner[rows] = squared[rows], number
+            position[rows], normal[rows] = table.position[0, sample[rows]], table.normal[0, sample[rows]]
+        return self._moved(poses, owner, position, normal)
+
+    def near(self, pose: "Poses", count: int, rng: np.random.Generator) -> "Poses":
+        """Poses of states near one: all joints turned a little, or one of them anywhere, with most of it in place."""
+        joints, many = len(self.mechanism.free), pose.rows(np.zeros(count, dtype=int))
+        step, anywhere = rng.standard_normal((2, count, joints))
+        is_single = np.arange(joints) == rng.integers(max(joints, 1), size=(count, 1))
+        single, little = np.where(is_single, anywhere, pose.z), pose.z + NEAR * step
+        z = np.where(np.arange(count)[:, None] % 2, single, little).astype(np.float32)
+        bent = replace(many, z=z)
+        target, states = self.few(pose).position[0], self.few(bent).position
+        equal = np.ones(len(target), dtype=np.float32)
+        _, rotation, translation = robust_poses(states, target, equal, AGREES * self.mechanism.half)
+        return replace(
+            bent,
+            rotation=(many.rotation @ rotation).astype(np.float32),
+            translation=many.place(translation[:, None].astype(np.float32))[:, 0],
+        )
+
+    def few(self, poses: "Poses") -> Samples:
+        """Samples of each pose's state, evenly spread, as many as points that it is compared with."""
+        return self._moved(poses, *(np.broadcast_to(part, (len(poses), *part.shape)) for part in self.few_at_rest))
+
+    def _moved(
+        self,
+        poses: "Poses",
+        owner: Int[np.ndarray, "n p"],
+        position: Float32[np.ndarray, "n p 3"],
+        normal: Float32[np.ndarray, "n p 3"],
+    ) -> Samples:
+        """Samples at rest in the poses' states."""
+        pose = np.arange(len(poses))[:, None]
+        T, D = (part.astype(np.float32)[pose, owner, ..., :3, :] for part in self.mechanism.motions(poses.z))
+        moved, turned = (np.einsum("npij,npj->npi", T[..., :3], part) for part in (position, normal))
+        motion = np.einsum("npkij,npj->npik", D[..., :3], position) + np.swapaxes(D[..., 3], 2, 3)
+        return Samples(moved + T[..., 3], turned, motion)
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
@@ -129,15 +268,24 @@ BLOCK = 150
 OUTSIDE = FitConfig.silhouette_weight * SILHOUETTE_VERTICES / FitConfig.cloud_weight
 """Weight of what the frame rules out relative to that of the cloud: as in the fit."""
 
+NEAR = 0.4
+"""Deviation of the states of a mechanism that are tried near another one, in the numbers of all joints."""
+
 FARTHEST = 0.5
-"""Largest turn of one step, rad, and largest change of the scale's logarithm."""
+"""Largest turn of one step, rad, and largest change of the scale's logarithm and of a joint's number."""
 
 
 @dataclass(frozen=True, eq=False)
 class Poses:
-    """Many poses of states, given by rows of the tables, with their costs as last computed."""
+    """Many poses of states, with their costs as last computed.
+
+    Attributes:
+        state: rows of the tables, in which a pose began.
+        z: coefficients, of the state or, of a mechanism, as they are now.
+    """
 
     state: Int[np.ndarray, " n"]
+    z: Float32[np.ndarray, "n k"]
     rotation: Float32[np.ndarray, "n 3 3"]
     translation: Float32[np.ndarray, "n 3"]
     log_scale: Float32[np.ndarray, " n"]
@@ -365,7 +513,21 @@ class Screen:
             log_scale = (0.5 * np.log(seen / np.maximum(spread, 1e-9))).astype(np.float32)
         shift = np.exp(log_scale)[:, None] * np.einsum("nij,nj->ni", rotation, middle)
         none = np.full(len(state), np.inf, dtype=np.float32)
-        return Poses(state, rotation, (center - shift).astype(np.float32), log_scale, none)
+        return Poses(state, self.tables.z[state], rotation, (center - shift).astype(np.float32), log_scale, none)
+
+    def best(self, poses: Poses, count: int) -> Poses:
+        """Poses that the frame has drawn to it, by rigid steps and those of joints: the best that differ."""
+        for sigma, share in SIGMAS:
+            poses = self.scored(poses, sigma, moves=True)
+            kept = max(round(share * len(poses)), 2 * count)
+            poses = poses.rows(np.argsort(poses.cost)[:kept])
+        return self.differing(self.scored(poses, SIGMAS[-1][0]), count)
+
+    def differing(self, poses: Poses, count: int) -> Poses:
+        """The best poses that differ, so many of them."""
+        poses = poses.rows(np.argsort(poses.cost))
+        places = poses.place(self.tables.few(poses).position[:, ::4])
+        return poses.rows(np.array(diverse_rows(places, self.tables.apart * self.half, rms_distance)[:count]))
 
     def scored(self, poses: Poses, sigma: float, moves: bool = False) -> Poses:
         """Poses with their costs for a sigma in shares of ``half``, after a rigid step from there if it ``moves`` them.
@@ -377,74 +539,92 @@ class Screen:
             return Poses.of_all(list(pool.map(lambda block: self._step(block, sigma * self.half, moves), blocks)))
 
     def _step(self, poses: Poses, sigma: float, moves: bool) -> Poses:
-        tables, state = self.tables, poses.state[:, None]
         size = np.exp(poses.log_scale)[:, None, None]
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
-        index = clipped((seen - tables.low[state]) / tables.cell[state][..., None], CELLS)
-        sample = tables.nearest[state, (index[..., 0] * CELLS + index[..., 1]) * CELLS + index[..., 2]]
-        position, normal = tables.position[state, sample], tables.normal[state, sample]
+        (position, normal, motion), (few, _, few_motion) = self.tables.met(poses, seen), self.tables.few(poses)
         offset, narrow = seen - position, sigma / size[..., 0]
         facing = self.sight.facing(poses, position, normal)
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
         squared = np.where(facing, squared, squared + ROBUST**2)
-        few = tables.position[poses.state, :: max(1, tables.position.shape[1] // POINTS)]
         direction, amount = self.sight.violations(poses.place(few), ROBUST * sigma)
         outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
         cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
         cost = cost + OUTSIDE * (outside / (1.0 + outside / robust)).mean(axis=1)
+        bent, bends = poses.z[:, : motion.shape[3]], np.arange(7, 7 + motion.shape[3])
+        cost = cost + (bent**2).sum(axis=1) / FitConfig.cloud_weight
         poses = replace(poses, cost=cost.astype(np.float32))
         if not moves:
             return poses
         weight = np.where(facing, 1.0 / (1.0 + squared / ROBUST**2) ** 2, 0.0) / len(self.points)
         weight_outside = OUTSIDE / few.shape[1] / (1.0 + outside / robust) ** 2
-        rows = np.concatenate([np.cross(seen, normal), normal, -np.einsum("npi,npi->np", seen, normal)[..., None]], 2)
+        rows = _derivatives(seen, normal, motion)
         toward = np.matmul(direction, poses.rotation)  # in the model's frame, where a sample moves the other way
-        pull = -np.concatenate([np.cross(few, toward), toward, -np.einsum("nwi,nwi->nw", few, toward)[..., None]], 2)
+        pull = -_derivatives(few, toward, few_motion)
         across, beyond = np.einsum("npi,npi->np", offset, normal), -amount / size[..., 0]
         parts = (rows, pull), (across, beyond), (weight, np.where(amount > 0, weight_outside, 0.0))
         rows, residual, weight = (np.concatenate(part, axis=1) for part in parts)
         matrix, gradient = _normal_equations(rows, residual, weight)
+        matrix[:, bends, bends] += narrow**2 / FitConfig.cloud_weight
+        gradient[:, bends] += narrow**2 / FitConfig.cloud_weight * bent
         # with planes alone, poses far away would slide past each other
-        near, pulled = _along(seen, offset, 0.2 * weight[:, : len(self.points)])
+        near, pulled = _along(seen, offset, motion, 0.2 * weight[:, : len(self.points)])
         return _moved(poses, matrix + near, gradient + pulled, self.scaled)
 
 
+def _derivatives(
+    points: Float[np.ndarray, "n r 3"], across: Float[np.ndarray, "n r 3"], motion: Float[np.ndarray, "n r 3 k"]
+) -> Float[np.ndarray, "n r q"]:
+    """Derivatives of points' distances along directions, by pose, scale and the numbers that move samples from them."""
+    shrunk, moved = np.einsum("nri,nri->nr", points, across), np.einsum("nri,nrik->nrk", across, motion)
+    return np.concatenate([np.cross(points, across), across, -shrunk[..., None], -moved], axis=2)
+
+
 def _normal_equations(
-    rows: Float[np.ndarray, "n r 7"], residual: Float[np.ndarray, "n r"], weight: Float[np.ndarray, "n r"]
-) -> tuple[Float[np.ndarray, "n 7 7"], Float[np.ndarray, "n 7"]]:
+    rows: Float[np.ndarray, "n r q"], residual: Float[np.ndarray, "n r"], weight: Float[np.ndarray, "n r"]
+) -> tuple[Float[np.ndarray, "n q q"], Float[np.ndarray, "n q"]]:
     weighted = (rows * weight[..., None]).transpose(0, 2, 1)
     return np.matmul(weighted, rows), np.matmul(weighted, residual[..., None])[..., 0]
 
 
 def _along(
-    seen: Float[np.ndarray, "n p 3"], offset: Float[np.ndarray, "n p 3"], weight: Float[np.ndarray, "n p"]
-) -> tuple[Float[np.ndarray, "n 7 7"], Float[np.ndarray, "n 7"]]:
+    seen: Float[np.ndarray, "n p 3"],
+    offset: Float[np.ndarray, "n p 3"],
+    motion: Float[np.ndarray, "n p 3 k"],
+    weight: Float[np.ndarray, "n p"],
+) -> tuple[Float[np.ndarray, "n q q"], Float[np.ndarray, "n q"]]:
     """Normal equations of the points' distances in space, from the nearest samples."""
-    rows = np.zeros((*seen.shape, 7), dtype=np.float32)
+    rows = np.zeros((*seen.shape, 7 + motion.shape[3]), dtype=np.float32)
+    rows[..., 7:] = -motion
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
         rows[:, :, i, j], rows[:, :, i, k] = seen[..., k], -seen[..., j]
         rows[:, :, i, 3 + i], rows[:, :, i, 6] = 1.0, -seen[..., i]
     count = len(seen)
-    return _normal_equations(rows.reshape(count, -1, 7), offset.reshape(count, -1), np.repeat(weight, 3, axis=1))
+    return _normal_equations(
+        rows.reshape(count, -1, rows.shape[3]), offset.reshape(count, -1), np.repeat(weight, 3, axis=1)
+    )
 
 
-def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.ndarray, "n 7"], scaled: bool) -> Poses:
+def _moved(poses: Poses, matrix: Float[np.ndarray, "n q q"], gradient: Float[np.ndarray, "n q"], scaled: bool) -> Poses:
     """Poses after the step of the normal equations."""
-    count = 7 if scaled else 6
-    matrix, gradient = matrix[:, :count, :count].astype(np.float64), gradient[:, :count].astype(np.float64)
+    matrix, gradient = matrix.astype(np.float64), gradient.astype(np.float64)
+    free = np.delete(np.arange(gradient.shape[1]), [] if scaled else 6)  # without the scale
+    matrix, step = matrix[:, free][:, :, free], np.zeros_like(gradient)
     diagonal = np.einsum("nkk->nk", matrix)
-    matrix = matrix + (DAMPING * diagonal + 1e-9)[:, :, None] * np.eye(count)
-    step = -np.linalg.solve(matrix, gradient[..., None])[..., 0]
+    matrix = matrix + (DAMPING * diagonal + 1e-9)[:, :, None] * np.eye(len(free))
+    step[:, free] = -np.linalg.solve(matrix, gradient[:, free, None])[..., 0]
     angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
     step[:, :3] *= np.minimum(1.0, FARTHEST / np.maximum(angle, 1e-9))
     log_scale = poses.log_scale.astype(np.float64)
     if scaled:
         log_scale = log_scale + np.clip(step[:, 6], -FARTHEST, FARTHEST)
     rotation = poses.rotation @ Rotation.from_rotvec(-step[:, :3]).as_matrix()
+    bent = poses.z.copy()
+    bent[:, : step.shape[1] - 7] += np.clip(step[:, 7:], -FARTHEST, FARTHEST)
     shift = np.exp(log_scale)[:, None] * np.einsum("nij,nj->ni", rotation, step[:, 3:6])
     return replace(
         poses,
         rotation=rotation.astype(np.float32),
+        z=bent,
         translation=(poses.translation - shift).astype(np.float32),
         log_scale=log_scale.astype(np.float32),
     )
@@ -456,26 +636,31 @@ def _moved(poses: Poses, matrix: Float[np.ndarray, "n 7 7"], gradient: Float[np.
 class SearchRound(NamedTuple):
     """Round of the search: medoids of the library (0: the mean state), rotations of each, bent and fitted at most.
 
-    Where there are fewer medoids, as of a rigid object, each has more rotations.
+    Where there are fewer medoids, as of a rigid object, each has more rotations. ``near`` is how often states of a
+    mechanism near the best are tried.
     """
 
     states: int
     rotations: int
     bent: int
     fitted: int
+    near: int = 0
 
 
-ROUNDS = (SearchRound(0, 400, 12, 4), SearchRound(12, 200, 24, 6))
+FIRST, SECOND = SearchRound(0, 400, 12, 4), SearchRound(12, 200, 24, 6)
+ROUNDS = FIRST, SECOND
 """Rounds of the search, one after the other while the frame is not explained."""
+
+MECHANISM_ROUNDS = (
+    FIRST._replace(states=SECOND.states, rotations=FIRST.rotations // SECOND.states, bent=SECOND.bent, near=6),
+)
+"""Those of a mechanism (docs/experiments.md, entry 96)."""
 
 SIGMAS = (
     *((0.15, 1.0), (0.15, 0.7), (0.12, 0.6), (0.1, 0.6), (0.08, 0.6), (0.06, 0.7)),
     *((0.05, 1.0), (0.05, 1.0), (0.05, 1.0)),
 )
 """The cloud's standard deviation in each rigid step, in half lengths, and which share of the poses go on after it."""
-
-APART = 0.15
-"""Distance between two poses' samples, as a share of the half length, up to which they are one."""
 
 RIVAL = 1.5
 """Misfit by few points, in misfits of the best, up to which a candidate may still be as good."""
@@ -538,9 +723,9 @@ class Trail:
             problem.shares_noise and (settled := settled_once(problem, best.posed)).explains(settled.problem)
         )
 
-    def go_on(self, stage: SearchRound) -> None:
+    def go_on(self, stage: SearchRound, poses: list[Posed]) -> None:
         """Fit the candidates of a round that may be the best, and explore from there."""
-        ranked = bend_by_few(self.problem, screen_poses(self.problem, stage), stage.fitted)
+        ranked = bend_by_few(self.problem, poses, stage.fitted)
         fitted = list[ScoredFit]()
         for cost, posed in ranked[: stage.fitted]:
             if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=_total).explains(self.problem):
@@ -631,9 +816,13 @@ def search(
         chosen = likelier(with_left_noise(trails))
         if not rounds or (chosen.is_explained and not chosen.problem.shares_noise):
             return chosen.with_heavier_cloud() or chosen.with_shared_noise()
+    screened = trails
+    if isinstance(whole.model, Mechanism):  # its poses take seconds, so that which rules out least says those of both
+        rounds, screened = MECHANISM_ROUNDS[: len(rounds)], trails[-1:]
     for stage in rounds:
-        for trail in trails:
-            trail.go_on(stage)
+        poses = [screen_poses(trail.problem, stage) for trail in screened]
+        for trail, each in zip(trails, cycle(poses)):
+            trail.go_on(stage, each)
         for trail, other in permutations(trails, 2):  # either may have found what the other has missed
             trail.fitted.append(refined(trail.problem, other.best.posed))
         trails = with_left_noise(trails)
@@ -665,17 +854,14 @@ def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
     """Choose diverse poses from which bending goes on."""
     tables = tables_of(problem.model, stage.states)
     screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
-    poses = screen.starts(rotations(stage.rotations * max(stage.states, 1) // len(tables.z)))
-    for sigma, share in SIGMAS:
-        poses = screen.scored(poses, sigma, moves=True)
-        count = max(round(share * len(poses)), 2 * stage.bent)
-        poses = poses if count >= len(poses) else poses.rows(np.argpartition(poses.cost, count)[:count])
-    poses = screen.scored(poses, SIGMAS[-1][0])
-    poses = poses.rows(np.argsort(poses.cost))
-    positions = poses.place(tables.position[poses.state, ::16])
+    poses = screen.best(screen.starts(rotations(stage.rotations * max(stage.states, 1) // len(tables.z))), stage.bent)
+    rng = np.random.default_rng(0)
+    for _ in range(stage.near * min(problem.model.count, 1)):
+        near = Poses.of_all([tables.near(poses.rows(np.array([row])), stage.bent, rng) for row in range(len(poses))])
+        poses = screen.differing(Poses.of_all([poses, screen.best(near, stage.bent)]), stage.bent)
     states = list[Posed]()
-    for row in diverse_rows(positions, APART * problem.model.half, rms_distance)[: stage.bent]:
-        rotation, z = Rotation.from_matrix(poses.rotation[row]).as_matrix(), tables.z[poses.state[row]]
+    for row in range(len(poses)):
+        rotation, z = Rotation.from_matrix(poses.rotation[row]).as_matrix(), poses.z[row]
         translation, log_scale = poses.translation[row].astype(np.float64), float(poses.log_scale[row])
         states.append(Posed(rotation, translation, z.astype(np.float64), log_scale))
     return states

@@ -8,7 +8,7 @@ newest frame, begins a new track. The first frame waits for its search.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -38,9 +38,8 @@ from mereo.io.cores import limit_blas_threads
 from mereo.models.calibration import Calibration
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation
-from mereo.scenes.parameters import known_distances, model_in
 from mereo.scenes.scene import Scene
-from mereo.scenes.statistical_model import PairDistances, StatisticalModel
+from mereo.scenes.statistical_model import StatisticalModel
 
 # --- one frame's fit from the state of the frame before ---------------------------------------------------------------
 
@@ -112,10 +111,9 @@ class Track:
     def squared(self) -> Float[np.ndarray, "p p"]:
         """Mean square of a material point's way, as a form of the parameters' step."""
         model = self.problem.model
-        modes = model.modes[model.sparse]
-        position = self.posed.place(model.mean[model.sparse] + modes @ self.posed.z.astype(np.float32))
-        jacobian = in_space(self.posed, position, modes).astype(np.float64)
-        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(modes)
+        position = self.posed.place(model.positions(self.posed.z[None], model.sparse)[0])
+        jacobian = in_space(self.posed, position, model.tangent(self.posed.z, model.sparse)).astype(np.float64)
+        form: Float[np.ndarray, "p p"] = jacobian.T @ jacobian / len(model.sparse)
         return form
 
     @property
@@ -143,9 +141,8 @@ def next_fit(
     cloud: CloudToFit,
     time_s: float,
     config: TrackConfig,
-    known: Sequence[PairDistances] = (),
 ) -> tuple[ModesFit, Track]:
-    """Fit the modes to a frame of which distances are ``known``, and return the fit with the track that ends with it.
+    """Fit the modes to a frame, and return the fit with the track that ends with it.
 
     Where the lines of sight of ``cloud`` leave it open, the object is seen whole or in part as it was when the track
     began; where it was seen whole and the frame rules that out by more than ``WHOLE``, it is fitted as seen in part
@@ -159,7 +156,7 @@ def next_fit(
         def fit(other_lines: SightKind) -> ModesFit:
             like = replace(cloud, lines=replace(lines, other_lines=other_lines))
             evidence = like.evidence(track.unit, config.observed_samples, config.points)
-            problem = track.problem.changed(evidence=evidence).with_distances(*known)
+            problem = track.problem.changed(evidence=evidence)
             posed = descend(problem, start, precision, config)
             return ModesFit(problem, track.unit, posed, 0.0, calibration=track.calibration)
 
@@ -258,10 +255,6 @@ class TrackedFrame:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-
-    def distances(self, model: StatisticalModel) -> tuple[PairDistances, ...]:
-        """What the scene says of the distances of a model's material points, where there is one."""
-        return () if self.scene is None else (known_distances(self.scene, model),)
 
 
 class SynchronousExecutor(Executor):
@@ -421,7 +414,7 @@ class Tracker:
         passed_s = time_s - track.time_s
         if not 0 <= passed_s <= longest_s:
             return None, f"it was last followed {passed_s:.1f} s before"
-        model = model_in(frame.scene, self.registrar.model)
+        model = self.registrar.narrowed(frame.scene).states
         if model is not track.problem.model:  # values of other joints are known
             track = track.in_model(model)
         cloud = seen.cloud.transformed(self._T_camera_input)
@@ -433,7 +426,7 @@ class Tracker:
         near = CloudToFit(kept.points, outliers=points[~keep], lines=lines, normals=kept.normals)
 
         def fit(config: TrackConfig) -> _Tracked:
-            fitted, after = next_fit(track, near, time_s, config, frame.distances(model))
+            fitted, after = next_fit(track, near, time_s, config)
             return _Tracked(fitted, after, Reading(seen.cloud, keep))
 
         tracked = fit(self.config)
@@ -495,9 +488,11 @@ class Tracker:
         self._search.drop()
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
-        calibration = None if model is None else model.calibration
         recognition = recognize(
-            tracked.fitted.registration, calibration, stated_scene_unit=stated, has_weights=model is not None
+            tracked.fitted.registration,
+            self.registrar.calibration,
+            stated_scene_unit=stated,
+            has_weights=model is not None,
         )
         recognition = recognition.doubted(frame.seen.doubt)
         seen = in_registered_unit(frame.seen, self.registrar, tracked.fitted.registration, recognition)

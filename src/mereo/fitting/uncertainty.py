@@ -266,11 +266,11 @@ class ModesOptimum:
     def posterior(self) -> Posterior:
         """Posterior of pose, scale and coefficients."""
         model = self.problem.model
-        material = self.posed.place(model.material(self.posed.z))
+        material, tangent = self.posed.place(model.material(self.posed.z)), model.tangent(self.posed.z)
         with limit_blas_threads():
             open = [turns_left_open(self.problem, material)]
             open += [] if self.bent is None else [(self.bent - material)[:, :, None]]
-            return Posterior.of(self.terms.total, self.posed, material, model.modes, model.residue, open, self.others)
+            return Posterior.of(self.terms.total, self.posed, material, tangent, model.residue, open, self.others)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

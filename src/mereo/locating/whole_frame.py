@@ -172,11 +172,11 @@ class WholeFrame:
         """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
         frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
         cloud, registrar = cloud_to_fit(frame, seen.lines, self.unit), self.registrar
-        return Problem(registrar.model, cloud.evidence(self.unit), cloud.scale_std, registrar.config)
+        return Problem(registrar.states, cloud.evidence(self.unit), cloud.scale_std, registrar.config)
 
     def place(self, mask: Bool[np.ndarray, "h w"], states: Sequence[Posed]) -> Place:
         """Place of some states."""
-        model, (posed, *_) = self.registrar.model, states
+        model, (posed, *_) = self.registrar.states, states
         mesh = model.mesh(self.unit * posed.place(model.material(posed.z)))
         return Place(mask, tuple(states), mesh, self.outline(mesh))
 

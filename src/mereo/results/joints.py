@@ -95,7 +95,7 @@ def _measured(registration: Registration, scene: Scene | None) -> JointValues:
     motion = None if scene is None else scene.sample_deformations
     if scene is None or not isinstance(motion, RandomMotion) or not motion.joints:
         return {}
-    leaders = list(dict.fromkeys(joint.follows or joint.name for joint, _ in motion.joints.values()))  # as drawn
+    leaders = motion.leaders
     rows = np.unique(np.concatenate([anchors[:: 1 + len(anchors) // 64] for anchors in registration.model.anchors]))
     fit = _fit_shares(registration, motion, leaders, rows)
     reach = _reach(registration, fit, rows)

@@ -19,11 +19,10 @@ from zlib import crc32
 import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
-from numpy.linalg import norm
 from numpy.random import default_rng
 from scipy.special import ndtr, ndtri
 
-from mereo.deformation.maps import Deformations, moved_by
+from mereo.deformation.maps import Deformations
 from mereo.deformation.samplers import JointSampler, RandomMotion
 from mereo.geometry.conventions import Names, Pair, Range
 from mereo.io.bounds import NotNegative, Number, check_value
@@ -31,10 +30,10 @@ from mereo.io.cores import limit_blas_threads
 from mereo.io.errors import AnyPath, value_text
 from mereo.io.yaml_document import Document
 from mereo.scenes.draw_recorder import Call, Key, OutOfDraws, Place, Recorder, Shares, Trail
+from mereo.scenes.mechanism import Mechanism, joints_alone
 from mereo.scenes.random_states import OBJECT_STATES, STATES_SEED, build_model, sample_states
 from mereo.scenes.scene import Scene
-from mereo.scenes.seeds import example_rng
-from mereo.scenes.statistical_model import FLOOR, LEAST_RATIO, PairDistances, StatisticalModel
+from mereo.scenes.statistical_model import StatisticalModel
 
 MANY, MANY_NORMAL = 48, 3
 """An array of more numbers than the first, or of more normal ones than the second, gets one slider."""
@@ -388,11 +387,25 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
     return replace(scene, sample_deformations=motion.narrowed(shares))
 
 
+def with_frame_joints(scene: Scene | None, given: Any) -> Scene:
+    """Scene ``with_joints`` of one frame of a sequence; raises ``ValueError`` also where more moves than joints."""
+    known = with_joints(scene, given)
+    if joints_alone(known) is None:
+        raise ValueError(
+            "values of joints are given with a frame, but the object bends as well: give those that stay as they are "
+            "before the first frame"
+        )
+    return known
+
+
 def narrowed_model(scene: Scene, model: StatisticalModel) -> StatisticalModel:
     """Statistical model of the states of a scene ``with_joints``, with the material points of ``model``, its object's.
 
-    It is made in seconds, at once where all values are known.
+    It is made in seconds, at once of a mechanism and where all values are known.
     """
+    mechanism = Mechanism.of(scene, model)
+    if isinstance(mechanism, Mechanism):
+        return mechanism
     motion = scene.sample_deformations
     assert isinstance(motion, RandomMotion)
     joints = [joint for joint, _ in motion.joints.values()]
@@ -402,29 +415,6 @@ def narrowed_model(scene: Scene, model: StatisticalModel) -> StatisticalModel:
         made = build_model(model.rest, model.nodes, model.node_labels, states)
     rests = all(joint.shares[0] <= joint.share(0.0) <= joint.shares[1] for joint in joints)
     return replace(made, source_frame=model.source_frame, rests=rests)
-
-
-def model_in(scene: Scene | None, model: StatisticalModel) -> StatisticalModel:
-    """Statistical model of a scene whose joints are all known, which is made at once; of another one ``model``."""
-    return model if scene is None or parameters(random_state(scene, STATES_SEED)) else narrowed_model(scene, model)
-
-
-COMPARED, TRIED = 100, 24
-"""Material points between which known joints say distances, and states among which these must not vary."""
-
-
-def known_distances(scene: Scene, model: StatisticalModel) -> PairDistances:
-    """Distances of material points of ``model`` that all states of a scene ``with_joints`` keep, but its own do not."""
-    rows = model.sparse[:COMPARED]
-    points, owners = model.rest_points[rows], model.labels[rows] - 1
-    drawn = (scene.sample_deformations(example_rng(STATES_SEED, i)) for i in range(TRIED))
-    states = np.stack([moved_by(points, owners, deformations) for deformations in drawn])
-    others = model.sparse_library[:: max(1, len(model.sparse_library) // TRIED), :COMPARED]
-    first, second = np.triu_indices(len(rows), 1)
-    kept, usual = (norm(each[:, first] - each[:, second], axis=2) for each in (states, others))
-    std = np.maximum(kept.std(axis=0), FLOOR * model.half)
-    known = np.flatnonzero(usual.std(axis=0) > LEAST_RATIO * std)
-    return PairDistances(rows[first[known]], rows[second[known]], kept.mean(axis=0)[known], std[known])
 
 
 def _values(given: Any, names: list[str]) -> dict[str, Range]:

@@ -37,6 +37,9 @@ MaterialPoints = Float[ndarray, "m 3"]
 PerMode = Float[ndarray, " k"]
 """A number for each mode."""
 
+Rows = Int[ndarray, " r"] | slice
+"""Some of the material points, by their indices."""
+
 # --- distances that all states keep -----------------------------------------------------------------------------------
 
 # A linear model of states is too wide where states are not linear: it stretches a rope that only bends, and shears a
@@ -136,8 +139,8 @@ class StatisticalModel:
         residue: root mean square distance of held-out states from the model.
         pairs: distances that the states keep, which the linear model alone does not.
         source_frame: frame of the object's own files; None in models from before it was kept.
-        is_normal: whether the states are the normal distribution of the modes itself, as those of an elastic solid, so
-            that a fit's surroundings in the library say nothing more.
+        is_normal: whether the states are the normal distribution of the modes itself, as those of an elastic solid or
+            a mechanism, so that a fit's surroundings in the library say nothing more.
         is_held: whether parts of the object at rest do not move in its states, so that a pose of it is that of theirs.
         rests: whether the rest pose is one of its states; not where joints have other values, as is known. No file
             has it.
@@ -246,8 +249,7 @@ class StatisticalModel:
     @cached_property
     def sparse_library(self) -> Float32[ndarray, "n p 3"]:
         """Positions of these few in all states of the library."""
-        motion = self.library @ self.modes[self.sparse].reshape(3 * len(self.sparse), self.count).T
-        return self.mean[self.sparse].astype(np.float32) + motion.reshape(len(self.library), -1, 3)
+        return self.positions(self.library, self.sparse).astype(np.float32)
 
     def around(self, mean: MaterialPoints, modes: Float32[ndarray, "m 3 d"]) -> "StatisticalModel":
         """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
@@ -259,6 +261,21 @@ class StatisticalModel:
     def material(self, z: PerMode) -> MaterialPoints:
         """Positions of all material points, unposed."""
         return self.mean + (self.modes.reshape(3 * len(self.modes), self.count) @ z.astype(np.float32)).reshape(-1, 3)
+
+    def positions(self, z: Float[ndarray, "n k"], rows: Rows = slice(None)) -> Float[ndarray, "n r 3"]:
+        """Positions of some material points in states, unposed."""
+        mean, modes = self.mean[rows], self.modes[rows]
+        motion = z.astype(np.float32) @ modes.reshape(mean.size, self.count).T
+        return mean + motion.reshape(len(z), *mean.shape).astype(float)
+
+    def tangent(self, z: PerMode, rows: Rows = slice(None)) -> Float32[ndarray, "r 3 k"]:
+        """Motion of some material points for one standard deviation of each mode, at a state: everywhere the same."""
+        return self.modes[rows]
+
+    @property
+    def registered(self) -> "StatisticalModel":
+        """The model in which a state is kept: itself."""
+        return self
 
     @cached_property
     def motion(self) -> PerMode:

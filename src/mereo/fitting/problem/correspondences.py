@@ -85,17 +85,17 @@ def fit_correspondences(problem: Problem, matches: Correspondences, unit: float)
     """
     model, target, sigma = problem.model, matches.points / unit, problem.first_sigma
     weights = model.weights(matches.rest, matches.labels)
-    mean, modes = weights(model.mean), weights(model.modes)
+    mean = weights(model.mean)
     scale = scale_of(matches, unit) if problem.is_scale_open else 1.0
     T = robust_rigid(scale * mean, target, matches.confidence, sigma)
     posed = Posed(T[:3, :3], T[:3, 3], np.zeros(model.count), float(np.log(scale)))
     for std in sigma * WIDE ** np.linspace(1.0, 0.0, STEPS):
-        points = posed.place(mean + modes @ posed.z.astype(np.float32))
+        points, motion = posed.place(weights(model.material(posed.z))), weights(model.tangent(posed.z))
         offset = points - target
         weight = matches.confidence / matches.confidence.sum() * (WORTH / std**2)
         weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * std)
         normal = problem.known(posed, Prior.whole(model), 0.0)
-        normal = normal.add(in_space(posed, points, modes), offset.ravel(), np.repeat(weight, 3))
+        normal = normal.add(in_space(posed, points, motion), offset.ravel(), np.repeat(weight, 3))
         posed = posed.moved(normal.step(DAMPING))
     return replace(problem, network=NetworkTerm(target, weights, matches.confidence)), posed
 

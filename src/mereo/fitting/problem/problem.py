@@ -41,7 +41,7 @@ from mereo.fitting.problem.residuals import (
     silhouette_losses,
 )
 from mereo.fitting.problem.segments import Joints
-from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, PairDistances, StatisticalModel
+from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 COARSE = 3
 """How many times fewer observed samples a choice among many states needs."""
@@ -138,12 +138,6 @@ class Problem:
         """A problem of the same model, with what this one has prepared of the model's surface."""
         other = replace(self, **changes)
         vars(other).update({name: vars(self)[name] for name in ("pairs", "samples", "joints") if name in vars(self)})
-        return other
-
-    def with_distances(self, *known: PairDistances) -> "Problem":
-        """The problem of a frame of which these distances are known, in the place of earlier ones."""
-        other = self.changed()
-        vars(other)["pairs"] = PairTerm.of(self.model, *known)
         return other
 
     # what depends on the noise
@@ -349,10 +343,8 @@ class Problem:
     ) -> NormalEquations:
         """Sum with the samples of a state's surface that the frame rules out."""
         few = samples.few(self.config.silhouette_vertices)
-        points, modes = few.position.astype(np.float64), few.surface.modes[:, 0]
-        return add_silhouette(
-            normal, posed, points, lambda rows: modes[rows], self.evidence, sigma, self.config.silhouette_weight
-        )
+        points, weight = few.position.astype(np.float64), self.config.silhouette_weight
+        return add_silhouette(normal, posed, points, few.tangent, self.evidence, sigma, weight)
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""

@@ -5,7 +5,7 @@ modes.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 
 import igl
@@ -20,7 +20,8 @@ from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Row
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import unit_rows
-from mereo.scenes.statistical_model import PairDistances, StatisticalModel
+from mereo.scenes.mechanism import Mechanism, moved_by
+from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
 
@@ -54,24 +55,60 @@ class SampledSurface:
         index = np.broadcast_to(model.faces[face][:, None], combine.shape)
         rows = np.repeat(np.arange(3 * count), 3)
         frames = csr_array((combine.ravel().astype(np.float32), (rows, index.ravel())), (3 * count, len(model.mean)))
+        spacing = float(np.sqrt(ends[-1] / 2 / count))
+        if isinstance(model, Mechanism):
+            rest, none = (frames @ model.rest_points).reshape(count, 3, 3), np.empty((count, 3, 3, 0), np.float32)
+            owner = model.labels[model.faces[face, 0]].astype(np.int64) - 1
+            return SampledMechanism(rest.astype(np.float32), none, spacing, owner, model)
         modes = (frames @ model.modes.reshape(len(model.modes), -1)).reshape(count, 3, 3, model.count)
         mean = (frames @ model.mean).reshape(count, 3, 3)
-        spacing = float(np.sqrt(ends[-1] / 2 / count))
         return cls(mean.astype(np.float32), modes, spacing)
 
     def every(self, step: int) -> "SampledSurface":
         """Fewer samples."""
         return SampledSurface(self.mean[::step], self.modes[::step], self.spacing * np.sqrt(step))
 
+    def frames(self, z: Float[np.ndarray, " k"]) -> Float32[np.ndarray, "s 3 3"]:
+        """Frames in a state, unposed."""
+        flat: np.ndarray = self.modes.reshape(9 * len(self.mean), -1) @ z.astype(np.float32)
+        return self.mean + flat.reshape(self.mean.shape)
+
+    def tangent(self, z: Float[np.ndarray, " k"], rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
+        """Motion of the positions of some samples for one standard deviation of each mode, at a state."""
+        return self.modes[rows, 0]
+
     def posed(self, posed: Posed) -> "PosedSamples":
         """Samples of a state in the camera frame."""
-        flat = self.modes.reshape(9 * len(self.mean), -1) @ posed.z.astype(np.float32)
         turn = (np.exp(posed.log_scale) * posed.rotation.T).astype(np.float32)
-        frame = ((self.mean + flat.reshape(self.mean.shape)).reshape(-1, 3) @ turn).reshape(self.mean.shape)
+        frame = (self.frames(posed.z).reshape(-1, 3) @ turn).reshape(self.mean.shape)
         position = frame[:, 0] + posed.translation.astype(np.float32)
         normal = cross(frame[:, 1], frame[:, 2])
         normal /= np.maximum(np.sqrt(np.einsum("si,si->s", normal, normal)), 1e-30)[:, None]
-        return PosedSamples(self, position, normal, np.einsum("si,si->s", normal, position) < 0)
+        return PosedSamples(self, posed.z, position, normal, np.einsum("si,si->s", normal, position) < 0)
+
+
+@dataclass(frozen=True, eq=False)
+class SampledMechanism(SampledSurface):
+    """The same of a mechanism: ``mean`` at rest, without modes, and the index of the segment that moves each sample."""
+
+    owner: Int[np.ndarray, " s"]
+    mechanism: Mechanism
+
+    def every(self, step: int) -> "SampledSurface":
+        """Fewer samples."""
+        few = super().every(step)
+        return SampledMechanism(few.mean, few.modes, few.spacing, self.owner[::step], self.mechanism)
+
+    def frames(self, z: Float[np.ndarray, " k"]) -> Float32[np.ndarray, "s 3 3"]:
+        """Frames in a state, unposed."""
+        T = self.mechanism.motions(z)[0][self.owner].astype(np.float32)
+        frames: np.ndarray = self.mean @ T[:, :3, :3].transpose(0, 2, 1)
+        frames[:, 0] += T[:, :3, 3]
+        return frames
+
+    def tangent(self, z: Float[np.ndarray, " k"], rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
+        """Motion of the positions of some samples for one standard deviation of each joint's number, at a state."""
+        return moved_by(self.mechanism.motions(z)[1][self.owner[rows]], self.mean[rows, 0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,6 +116,7 @@ class PosedSamples:
     """Samples of a surface in the camera frame: positions, outward normals, whether the camera sees their outside."""
 
     surface: SampledSurface
+    z: Float[np.ndarray, " k"]
     position: Float32[np.ndarray, "s 3"]
     normal: Float32[np.ndarray, "s 3"]
     facing: Bool[np.ndarray, " s"]
@@ -86,7 +124,12 @@ class PosedSamples:
     def few(self, count: int) -> "PosedSamples":
         """About ``count`` samples, as evenly spread."""
         step = max(1, len(self.position) // count)
-        return PosedSamples(self.surface.every(step), self.position[::step], self.normal[::step], self.facing[::step])
+        parts = (part[::step] for part in (self.position, self.normal, self.facing))
+        return PosedSamples(self.surface.every(step), self.z, *parts)
+
+    def tangent(self, rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
+        """``SampledSurface.tangent`` at this state."""
+        return self.surface.tangent(self.z, rows)
 
     def planes(self, points: Float[np.ndarray, "p 3"], directions: Directions | None = None) -> Planes:
         """Planes of the facing samples nearest to points.
@@ -101,7 +144,7 @@ class PosedSamples:
             rows = rows if len(rows) else np.arange(len(self.position))
             tree = cKDTree(self.position[rows], balanced_tree=False, compact_nodes=False)
             near = rows[tree.query(points)[1]]
-        return self.position[near].astype(np.float64), self.normal[near].astype(np.float64), self.surface.modes[near, 0]
+        return self.position[near].astype(np.float64), self.normal[near].astype(np.float64), self.tangent(near)
 
 
 Met = tuple[Float[np.ndarray, " p"], Int[np.ndarray, " p"], Float[np.ndarray, "p 3"]]
@@ -134,11 +177,12 @@ class Surface:
     material: Float[np.ndarray, "m 3"]
     facing: Int[np.ndarray, " g"]
     normals: Float[np.ndarray, "g 3"]
+    z: Float[np.ndarray, " k"] | None = None
 
     @classmethod
     def of(cls, model: StatisticalModel, posed: Posed, shows: Shows = Evidence.shows) -> "Surface":
         """Surface of a state."""
-        return cls.through(model, posed.place(model.material(posed.z)), shows)
+        return replace(cls.through(model, posed.place(model.material(posed.z)), shows), z=posed.z)
 
     @classmethod
     def through(
@@ -219,7 +263,9 @@ class Surface:
         _, face, position = self.compared(points, far, directions)
         corners = self.model.faces[self.facing[face]]
         weight = barycentric(self.material[corners], position).astype(np.float32)
-        modes = np.matmul(weight[:, None], self.model.modes[corners].reshape(len(points), 3, -1))
+        assert self.z is not None
+        tangent = self.model.tangent(self.z, corners.ravel())
+        modes = np.matmul(weight[:, None], tangent.reshape(len(points), 3, -1))
         return position, self.normals[face], modes.reshape(len(points), 3, -1)
 
 
@@ -338,10 +384,6 @@ def are_near(model: StatisticalModel) -> bool:
     return gain > 0
 
 
-PAIRS = "first", "second", "mean"
-"""What of ``PairDistances`` is put together as it is."""
-
-
 @dataclass(frozen=True, eq=False)
 class PairTerm:
     """Distances that the states keep: mean and modes of vectors between points, mean and deviation of their lengths."""
@@ -352,12 +394,10 @@ class PairTerm:
     std: Float[np.ndarray, " q"]
 
     @classmethod
-    def of(cls, model: StatisticalModel, *known: PairDistances) -> "PairTerm":
-        """Term of the distances that a model's states keep, and of others that are ``known``, worth as much again."""
-        groups = [model.pairs, *known]
-        a, b, distance = (np.concatenate([getattr(each, name) for each in groups]) for name in PAIRS)
-        std = [each.std * np.sqrt(len(each) / max(1, len(a))) for each in groups]  # a mean over all is of each group's
-        return cls(model.mean[a] - model.mean[b], model.modes[a] - model.modes[b], distance, np.concatenate(std))
+    def of(cls, model: StatisticalModel) -> "PairTerm":
+        """Term of the distances that a model's states keep."""
+        a, b = model.pairs.first, model.pairs.second
+        return cls(model.mean[a] - model.mean[b], model.modes[a] - model.modes[b], model.pairs.mean, model.pairs.std)
 
     def _vectors(self, z: Float[np.ndarray, " k"]) -> tuple[Float[np.ndarray, "q 3"], Float[np.ndarray, " q"]]:
         vector = self.mean + self.modes @ z.astype(np.float32)

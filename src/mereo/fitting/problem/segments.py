@@ -56,7 +56,7 @@ class Joints:
         """Make states that differ from one in a single joint, ``each`` of every joint, as different as there are."""
         corners = positions(self.model, self.corners, posed.z[None].astype(np.float32))
         rotation, translation = segment_poses(self.model.mean[self.corners], corners)
-        shapes_of_branches = []
+        shapes_of_branches = [np.empty((0, self.corners.size, 3))]
         for fixed, hanging, moving in self.branches:
             # the hanging segment's pose in the fixed one's frame, in each state of the library and here
             inverse = self.rotation[:, fixed].transpose(0, 2, 1)
@@ -70,7 +70,7 @@ class Joints:
             shapes[:, moving] = moved.reshape(len(turn), -1, *corners.shape[2:])
             apart = different(moved.reshape(len(turn), -1), branch.ravel(), each)
             shapes_of_branches.append(shapes[apart].reshape(-1, self.corners.size, 3))
-        return self._expressed(np.concatenate(shapes_of_branches), posed) if shapes_of_branches else []
+        return self._expressed(np.concatenate(shapes_of_branches), posed)
 
     def _expressed(self, shapes: Float[np.ndarray, "n p 3"], posed: Posed) -> list[Posed]:
         """Find the states nearest to shapes of the corners in the frame of ``posed``'s modes."""
@@ -85,7 +85,7 @@ class Joints:
             middle = fitted.mean(axis=1, keepdims=True)
             rotation = best_rotations(np.matmul((fitted - middle).transpose(0, 2, 1), shapes - goal))
             unposed = np.matmul(shapes - goal, rotation) + middle
-            z = (unposed - mean).reshape(len(shapes), -1) @ solve.T
+            z = (unposed - mean).reshape(len(shapes), mean.size) @ solve.T
             fitted = mean + (z @ flat.T).reshape(shapes.shape)
         translation = (goal - middle @ rotation.transpose(0, 2, 1))[:, 0]
         shift = posed.place(translation)
@@ -102,8 +102,7 @@ def positions(
     model: StatisticalModel, corners: Int[np.ndarray, "s c"], z: Float32[np.ndarray, "n k"]
 ) -> Float[np.ndarray, "n s c 3"]:
     """Positions of the corners in states."""
-    motion = z @ model.modes[corners.ravel()].reshape(3 * corners.size, model.count).T
-    return model.mean[corners] + motion.reshape(len(z), *corners.shape, 3).astype(np.float64)
+    return model.positions(z, corners.ravel()).reshape(len(z), *corners.shape, 3)
 
 
 def sampled_positions(model: StatisticalModel, corners: Int[np.ndarray, "s c"]) -> Float[np.ndarray, "n s c 3"]:

@@ -21,7 +21,7 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.recognition import FEATURELESS, Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.search import ROUNDS, Screen, SearchRound, rotations, search, tables_of
+from mereo.fitting.search import MECHANISM_ROUNDS, ROUNDS, Screen, SearchRound, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.bounds import Cells, PositiveOrUnknown, check_value
@@ -31,6 +31,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import Reading
 from mereo.reconstruction.observation import Observation, main_length
 from mereo.reconstruction.pipeline import EncodedFrame, encode_frame
+from mereo.scenes.mechanism import Mechanism
 from mereo.scenes.statistical_model import StatisticalModel
 
 
@@ -178,8 +179,8 @@ def _searched(reading: Reading, registrar: Registrar, scene_unit: float | None, 
     frame = encode_frame(reading, registrar.starting_network, seen.frame.axes)
     if seen.initial_pose is None or scene_unit is None:
         return fit_states(frame, registrar, scene_unit, seen, matches=registrar.correspondences(frame.code))
-    start = initial_state(frame.T_camera_input @ seen.initial_pose, registrar.model, scene_unit)
-    return replace(fit_states(frame, registrar, scene_unit, seen, [start], ()), located_by="pose")
+    starts = initial_states(frame.T_camera_input @ seen.initial_pose, registrar.states, scene_unit)
+    return replace(fit_states(frame, registrar, scene_unit, seen, starts, ()), located_by="pose")
 
 
 def fit_states(
@@ -194,15 +195,16 @@ def fit_states(
     """Candidate of one hypothesis by ``search_modes``; raises ``NoFit`` where that cannot start."""
     cloud = cloud_to_fit(frame, seen.lines, scene_unit)
     check_size(frame, registrar.model, scene_unit)
-    modes = search_modes(cloud, registrar.model, registrar.config, states, rounds, matches)
+    modes = search_modes(cloud, registrar.states, registrar.config, states, rounds, matches)
     return Candidate(frame, replace(modes, calibration=registrar.calibration))
 
 
-def initial_state(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalModel, scene_unit: float) -> Posed:
-    """State of the model at rest with a pose as ``Result.pose``, in scene units."""
+def initial_states(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalModel, scene_unit: float) -> list[Posed]:
+    """States of the model with a pose as ``Result.pose``, in scene units: at rest, and those of a mechanism."""
     placed = transform_points(T_camera_model, model.source_points(scene_unit)) / scene_unit
-    T = fit_rigid(model.material(model.rest_z), placed)
-    return Posed(T[:3, :3], T[:3, 3], model.rest_z)
+    states = [model.rest_z, *(tables_of(model, MECHANISM_ROUNDS[0].states).z if isinstance(model, Mechanism) else ())]
+    poses = [fit_rigid(model.material(z), placed) for z in states]
+    return [Posed(T[:3, :3], T[:3, 3], z.astype(float)) for T, z in zip(poses, states, strict=True)]
 
 
 def cloud_to_fit(frame: EncodedFrame, lines: SightLines, scene_unit: float | None) -> CloudToFit:

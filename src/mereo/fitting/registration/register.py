@@ -5,6 +5,7 @@ CloudToFit -search_modes-> ModesFit -Registrar.finish-> Registration
 
 import time
 import warnings
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -40,6 +41,7 @@ from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.calibration import Calibration, RadiusFactors
 from mereo.models.trained import EncodedCloud, Trained
+from mereo.scenes.mechanism import Mechanism
 from mereo.scenes.parameters import narrowed_model
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import SCENES, AssetUnavailable, Scene
@@ -151,8 +153,6 @@ class ModesFit:
         Modes can imitate what they do not hold, with more of them than a scene has draws; the evidence counts that.
         It does not speak against draws, which have the states that there really are.
         """
-        if not self.may_take_draws:
-            return self.registration
         started = time.perf_counter()
         with limit_blas_threads():
             problem = DrawsProblem.of(self.problem, states)
@@ -172,12 +172,15 @@ class ModesFit:
     ) -> Registration:
         distance = self.problem.nearest(surface)[0]
         explained = float((distance <= self.tolerance).mean())
-        factors = RadiusFactors()
+        model, drawn, factors = self.problem.model, None, RadiusFactors()
+        if isinstance(model, Mechanism):  # whose numbers are the scene's draws
+            method, z = "draws", model.draws(z)
+            drawn, model = Drawn(STATES_SEED, z, model.sizes, np.ones(len(z), dtype=bool)), model.registered
         if self.calibration is not None:
             factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.is_noisy)
         misfit = 0.0 if factors.misfit is None else self.problem.cloud_misfit(surface)
         return Registration(
-            model=self.problem.model,
+            model=model,
             material=surface.material * self.unit,
             method=method,
             z=z,
@@ -186,6 +189,7 @@ class ModesFit:
             explained=explained,
             accepted=explained >= self.problem.accepted,
             seconds=self.seconds,
+            drawn=drawn,
             residual=float(np.sqrt((distance**2).mean())) * self.unit,
             ruled_out=self.problem.ruled_out(surface),
             needed=self.problem.accepted,
@@ -294,6 +298,13 @@ class Registrar:
             return None
         raise ValueError(f"{fault}, so its draws move other points: {CURE}, or use --method modes")
 
+    @cached_property
+    def states(self) -> StatisticalModel:
+        """Model whose states are fitted: a mechanism's, where its scene is known."""
+        with suppress(AssetUnavailable):
+            return Mechanism.of(self.scene, self.model)
+        return self.model
+
     @property
     def fits_draws(self) -> bool:
         """Whether the scene's draws are fitted too, for which its states are simulated once, in seconds."""
@@ -350,7 +361,7 @@ class Registrar:
         None without a scene, for a rigid object, for an elastic solid, whose modes are its draws, for more than
         ``MOST_DRAWS`` draws, and where the scene's mesh cannot be had: the weights carry all that the modes need.
         """
-        model = self.model
+        model = self.states
         try:
             if (
                 self.scene is None
