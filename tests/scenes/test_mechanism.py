@@ -1,5 +1,6 @@
 """The states of a mechanism are those that its scene plays, and its derivatives are theirs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,9 @@ from mereo.fitting.draws.playback import material_moved, shares_of
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.residuals import SampledSurface
 from mereo.fitting.search import MechanismTables, tables_of
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.mechanism import Mechanism
-from mereo.scenes.parameters import played_back, with_joints
+from mereo.scenes.parameters import played_back, with_frame_joints, with_joints
 from mereo.scenes.random_states import STATES_SEED
 from mereo.scenes.scene import Scene
 
@@ -37,9 +38,8 @@ def robot(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     if request.param == "gripper":
         return mereo.load_object(write_gripper(folder))
     path = folder / "lamp.urdf"
-    endless = request.param != "lamp"
-    text = LAMP.replace(TURN, "").replace('"turn" type="revolute"', '"turn" type="continuous"') if endless else LAMP
-    path.write_text(text)
+    endless = LAMP.replace(TURN, "").replace('"turn" type="revolute"', '"turn" type="continuous"')
+    path.write_text(LAMP if request.param == "lamp" else endless)
     return mereo.load_object(path)
 
 
@@ -80,8 +80,7 @@ def test_samples_lie_on_the_surface_of_a_state(mechanism: Mechanism) -> None:
 
 
 def test_a_state_is_found_again_from_its_points(mechanism: Mechanism) -> None:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = Rotation.random(random_state=0).as_matrix(), [1.0, 2.0, 3.0]
+    T = rigid(Rotation.random(random_state=0).as_matrix(), np.arange(3.0))
     for z in mechanism.library[3:6].astype(float):
         material = transform_points(T, mechanism.material(z))
         found, again = mechanism.project(material)
@@ -92,12 +91,16 @@ def test_a_joint_that_is_known_stays_where_it_is(robot: mereo.Object, mechanism:
     first, *others = mechanism.free
     joint = mechanism.chain.joints[first][0]
     value = joint.limits[0] + 0.3 * (joint.limits[1] - joint.limits[0])
-    known = with_joints(robot.scene, {first: value * (1.0 if joint.turns else robot.scene.unit_m)})
+    given = {first: value * (1.0 if joint.turns else robot.scene.unit_m)}
+    known = with_joints(robot.scene, given)
     narrowed = Mechanism.of(known, mechanism)
     assert isinstance(narrowed, Mechanism) and narrowed.free == tuple(others)
     z = np.full(len(others), 0.4)
     assert_allclose(narrowed.material(z), played(known, narrowed, z), atol=1e-4)
     assert narrowed.registered is mechanism.registered
+    moves = replace(mechanism.chain, steps=(*mechanism.chain.steps, (replace(joint, name=""), (0,))))
+    with pytest.raises(ValueError, match="with a frame, but the object bends as well: give those that stay"):
+        with_frame_joints(replace(robot.scene, sample_deformations=moves), given)
 
 
 def test_what_bends_has_a_linear_model() -> None:
@@ -108,7 +111,5 @@ def test_what_bends_has_a_linear_model() -> None:
 def test_a_segment_too_small_for_a_sample_is_left_out_of_the_screening(tmp_path: Path) -> None:
     path = tmp_path / "lamp.urdf"
     path.write_text(LAMP.replace("0.12 0.07 0.05", "0.002 0.002 0.002"))
-    lamp = mereo.load_object(path)
-    model = lamp.registrar().states
-    tables = tables_of(model, 2)
+    tables = tables_of(mereo.load_object(path).registrar().states, 2)
     assert isinstance(tables, MechanismTables) and sorted(tables.segments) == [0, 1, 2]

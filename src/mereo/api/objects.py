@@ -113,12 +113,11 @@ class Object:
             raise ValueError(
                 "the method is network, but the object has no weights: name them with --weights, or leave it out"
             )
-        if method not in self._registrars:
-            if self.network is not None:
-                self._registrars[method] = registrar_for(self.network, method, self.scene)
-            else:
-                assert self.model is not None
-                self._registrars[method] = Registrar(None, self.model, method, self.scene)
+        if method not in self._registrars and self.network is not None:
+            self._registrars[method] = registrar_for(self.network, method, self.scene)
+        elif method not in self._registrars:
+            assert self.model is not None
+            self._registrars[method] = Registrar(None, self.model, method, self.scene)
         registrar = self._registrars[method]
         if registrar is None and (self.knows_joints or frame_joints):
             raise ValueError(

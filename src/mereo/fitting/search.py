@@ -49,7 +49,7 @@ from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, Sam
 from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
-from mereo.scenes.mechanism import Mechanism
+from mereo.scenes.mechanism import Mechanism, moved_by
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 # --- tables of shapes -------------------------------------------------------------------------------------------------
@@ -128,28 +128,25 @@ class ShapeTables:
         return pose
 
     def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> "Samples":
-        """Samples near points of each pose's model frame."""
-        state = poses.state[:, None]
+        """Samples near points of each pose's model frame, and its ``places``."""
+        state, places = poses.state[:, None], self.places(poses)
         sample = self.looked_up(state, seen)
-        return Samples.still(self.position[state, sample], self.normal[state, sample])
+        still, few_still = (np.empty((*part.shape, 0), dtype=np.float32) for part in (seen, places))
+        return Samples(self.position[state, sample], self.normal[state, sample], still, places, few_still)
 
-    def few(self, poses: "Poses") -> "Samples":
-        """Samples of each pose's state, evenly spread, as many as points that it is compared with."""
-        step = max(1, self.position.shape[1] // POINTS)
-        return Samples.still(self.position[poses.state, ::step], self.normal[poses.state, ::step])
+    def places(self, poses: "Poses") -> Float32[np.ndarray, "n w 3"]:
+        """Positions of samples of each pose's state, evenly spread, as many as points that it is compared with."""
+        return self.position[poses.state, :: max(1, self.position.shape[1] // POINTS)]
 
 
 class Samples(NamedTuple):
-    """Samples of states, model frame, and their motion with the numbers of joints."""
+    """Samples of states, model frame: near points, and evenly spread ones, with their motion by joints' numbers."""
 
     position: Float32[np.ndarray, "n p 3"]
     normal: Float32[np.ndarray, "n p 3"]
     motion: Float32[np.ndarray, "n p 3 k"]
-
-    @classmethod
-    def still(cls, position: Float32[np.ndarray, "n p 3"], normal: Float32[np.ndarray, "n p 3"]) -> "Samples":
-        """Samples of states that stay as they are."""
-        return cls(position, normal, np.empty((*position.shape, 0), dtype=np.float32))
+    places: Float32[np.ndarray, "n w 3"]
+    places_motion: Float32[np.ndarray, "n w 3 k"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,12 +156,13 @@ class MechanismTables(ShapeTables):
     Attributes:
         mechanism: it.
         segments: tables of the segments at rest, by their indices; not of those that are too small for a sample.
-        few_at_rest: samples of the whole, evenly spread, at rest: their segments, positions and normals.
+        owner, at_rest: segments and positions at rest of samples of the whole, evenly spread.
     """
 
     mechanism: Mechanism
     segments: Mapping[int, ShapeTables]
-    few_at_rest: tuple[Int[np.ndarray, " w"], Float32[np.ndarray, "w 3"], Float32[np.ndarray, "w 3"]]
+    owner: Int[np.ndarray, " w"]
+    at_rest: Float32[np.ndarray, "w 3"]
 
     apart = BENT_APART
 
@@ -179,16 +177,12 @@ class MechanismTables(ShapeTables):
             for owner, rows in parts.items()
         }
         step = max(1, len(position) // POINTS)
-        return cls(
-            **vars(states),
-            mechanism=mechanism,
-            segments=segments,
-            few_at_rest=(surface.owner[::step], position[::step], normal[::step]),
-        )
+        few = {"owner": surface.owner[::step], "at_rest": position[::step]}
+        return cls(**vars(states), mechanism=mechanism, segments=segments, **few)
 
     def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> Samples:
-        """Samples near points of each pose's model frame, of the segments that come nearest."""
-        T = self.mechanism.motions(poses.z)[0].astype(np.float32)
+        """Samples near points of each pose's model frame, of the segments that come nearest, and its ``places``."""
+        T, D = (part.astype(np.float32) for part in self.mechanism.motions(poses.z))
         first, nearest = np.zeros((len(seen), 1), dtype=int), np.full(seen.shape[:2], np.inf, dtype=np.float32)
         owner, position, normal = np.zeros(seen.shape[:2], dtype=int), np.empty_like(seen), np.empty_like(seen)
         for number, table in self.segments.items():
@@ -199,7 +193,10 @@ class MechanismTables(ShapeTables):
             rows = squared < nearest
             nearest[rows], owner[rows] = squared[rows], number
             position[rows], normal[rows] = table.position[0, sample[rows]], table.normal[0, sample[rows]]
-        return self._moved(poses, owner, position, normal)
+        near, few = (owner, position), self._few(poses)
+        turned = np.einsum("npij,npj->npi", _of_segments(T, owner)[..., :3], normal)
+        motion, few_motion = (moved_by(_of_segments(D, owners), rest) for owners, rest in (near, few))
+        return Samples(_placed(T, *near), turned, motion, _placed(T, *few), few_motion)
 
     def near(self, pose: "Poses", count: int, rng: np.random.Generator) -> "Poses":
         """Poses of states near one: all joints turned a little, or one of them anywhere, with most of it in place."""
@@ -209,7 +206,7 @@ class MechanismTables(ShapeTables):
         single, little = np.where(is_single, anywhere, pose.z), pose.z + NEAR * step
         z = np.where(np.arange(count)[:, None] % 2, single, little).astype(np.float32)
         bent = replace(many, z=z)
-        target, states = self.few(pose).position[0], self.few(bent).position
+        target, states = self.places(pose)[0], self.places(bent)
         equal = np.ones(len(target), dtype=np.float32)
         _, rotation, translation = robust_poses(states, target, equal, AGREES * self.mechanism.half)
         return replace(
@@ -218,23 +215,26 @@ class MechanismTables(ShapeTables):
             translation=many.place(translation[:, None].astype(np.float32))[:, 0],
         )
 
-    def few(self, poses: "Poses") -> Samples:
-        """Samples of each pose's state, evenly spread, as many as points that it is compared with."""
-        return self._moved(poses, *(np.broadcast_to(part, (len(poses), *part.shape)) for part in self.few_at_rest))
+    def places(self, poses: "Poses") -> Float32[np.ndarray, "n w 3"]:
+        """Positions of samples of each pose's state, evenly spread, as many as points that it is compared with."""
+        return _placed(self.mechanism.motions(poses.z)[0].astype(np.float32), *self._few(poses))
 
-    def _moved(
-        self,
-        poses: "Poses",
-        owner: Int[np.ndarray, "n p"],
-        position: Float32[np.ndarray, "n p 3"],
-        normal: Float32[np.ndarray, "n p 3"],
-    ) -> Samples:
-        """Samples at rest in the poses' states."""
-        pose = np.arange(len(poses))[:, None]
-        T, D = (part.astype(np.float32)[pose, owner, ..., :3, :] for part in self.mechanism.motions(poses.z))
-        moved, turned = (np.einsum("npij,npj->npi", T[..., :3], part) for part in (position, normal))
-        motion = np.einsum("npkij,npj->npik", D[..., :3], position) + np.swapaxes(D[..., 3], 2, 3)
-        return Samples(moved + T[..., 3], turned, motion)
+    def _few(self, poses: "Poses") -> tuple[Int[np.ndarray, "n w"], Float32[np.ndarray, "n w 3"]]:
+        few = (len(poses), len(self.owner))
+        return np.broadcast_to(self.owner, few), np.broadcast_to(self.at_rest, (*few, 3))
+
+
+def _of_segments(parts: Float32[np.ndarray, "n s *k 4 4"], owner: Int[np.ndarray, "n p"]) -> np.ndarray:
+    """Motions of the segments of samples, or their derivatives."""
+    return parts[np.arange(len(owner))[:, None], owner, ..., :3, :]
+
+
+def _placed(
+    T: Float32[np.ndarray, "n s 4 4"], owner: Int[np.ndarray, "n p"], rest: Float32[np.ndarray, "n p 3"]
+) -> Float32[np.ndarray, "n p 3"]:
+    """Positions of samples at rest in states."""
+    each = _of_segments(T, owner)
+    return np.asarray(np.einsum("npij,npj->npi", each[..., :3], rest) + each[..., 3])
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
@@ -526,7 +526,7 @@ class Screen:
     def differing(self, poses: Poses, count: int) -> Poses:
         """The best poses that differ, so many of them."""
         poses = poses.rows(np.argsort(poses.cost))
-        places = poses.place(self.tables.few(poses).position[:, ::4])
+        places = poses.place(self.tables.places(poses)[:, ::4])
         return poses.rows(np.array(diverse_rows(places, self.tables.apart * self.half, rms_distance)[:count]))
 
     def scored(self, poses: Poses, sigma: float, moves: bool = False) -> Poses:
@@ -541,7 +541,7 @@ class Screen:
     def _step(self, poses: Poses, sigma: float, moves: bool) -> Poses:
         size = np.exp(poses.log_scale)[:, None, None]
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
-        (position, normal, motion), (few, _, few_motion) = self.tables.met(poses, seen), self.tables.few(poses)
+        position, normal, motion, few, few_motion = self.tables.met(poses, seen)
         offset, narrow = seen - position, sigma / size[..., 0]
         facing = self.sight.facing(poses, position, normal)
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2

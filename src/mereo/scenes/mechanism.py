@@ -8,7 +8,6 @@ Notation: s segments, k joints that are free, m material points, n states.
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -62,6 +61,8 @@ class Mechanism(StatisticalModel):
     def of(cls, scene: Scene | None, model: StatisticalModel) -> StatisticalModel:
         """Mechanism of a scene and of its statistical model; that itself where more moves than joints with names."""
         linear, motion = model.registered, joints_alone(scene)
+        if isinstance(model, Mechanism) and model.chain is motion:
+            return model
         if motion is None:
             return linear
         free = tuple(name for name in motion.leaders if np.ptp(motion.joints[name][0].shares) > 0)
@@ -90,8 +91,8 @@ class Mechanism(StatisticalModel):
 
     def draws(self, z: PerMode) -> Float[ndarray, " d"]:
         """Draws of the scene in a state, standard normal: of joints whose values are known too."""
-        shares = [float(self._share(name, z)[0]) for name in self.chain.leaders]
-        return ndtri([share if 0.0 < share < 1.0 else share % 1.0 for share in shares])
+        # the share of a joint without limits goes on beyond its range
+        return ndtri([self._share(name, z)[0] % 1.0 for name in self.chain.leaders])
 
     @cached_property
     def _twists(self) -> Float[ndarray, "j 4 4"]:
@@ -117,18 +118,7 @@ class Mechanism(StatisticalModel):
         return np.asarray(ndtr(number)), np.asarray(np.exp(-(number**2) / 2) / np.sqrt(2 * np.pi))
 
     def motions(self, z: Numbers) -> Motions:
-        """Motions of all segments in states; those of the last ones are kept."""
-        key = z.shape, z.tobytes()
-        kept = self._last.get("states")  # one object, as several threads may ask
-        if kept is None or kept[0] != key:
-            kept = self._last["states"] = key, self._motions(z)
-        return kept[1]
-
-    @cached_property
-    def _last(self) -> dict[str, tuple[Any, Motions]]:
-        return {}
-
-    def _motions(self, z: Numbers) -> Motions:
+        """Motions of all segments in states."""
         before, count = z.shape[:-1], len(self.vertex_counts)
         T, D = np.tile(np.eye(4), (*before, count, 1, 1)), np.zeros((*before, count, len(self.free), 4, 4))
         for twist, (joint, members) in zip(self._twists, self.chain.joints.values(), strict=True):
@@ -154,10 +144,8 @@ class Mechanism(StatisticalModel):
         rest, owners, T = self.rest_points[rows], self.labels[rows] - 1, self.motions(z)[0]
         result = np.empty((len(z), *rest.shape))
         for owner in np.unique(owners):
-            each = T[:, owner]
-            result[:, owners == owner] = (
-                rest[owners == owner] @ each[:, :3, :3].transpose(0, 2, 1) + each[:, None, :3, 3]
-            )
+            part, each = owners == owner, T[:, owner]
+            result[:, part] = rest[part] @ each[:, :3, :3].transpose(0, 2, 1) + each[:, None, :3, 3]
         return result
 
     def tangent(self, z: PerMode, rows: Rows = slice(None)) -> Float32[ndarray, "r 3 k"]:
@@ -167,9 +155,9 @@ class Mechanism(StatisticalModel):
     @cached_property
     def rest_z(self) -> PerMode:
         """Numbers of the joints at rest, none of them quite at its limit."""
-        shares = [(self.chain.joints[name][0].share(0.0), *self.chain.joints[name][0].shares) for name in self.free]
-        numbers = [ndtri(np.clip((share - low) / (high - low), 0.0, 1.0)) for share, low, high in shares]
-        return np.clip(np.array(numbers, dtype=float), -LARGEST_START, LARGEST_START)
+        joints = (self.chain.joints[name][0] for name in self.free)
+        shares = [(joint.share(0.0) - joint.shares[0]) / np.ptp(joint.shares) for joint in joints]
+        return np.clip(ndtri(np.clip(shares, 0.0, 1.0)), -LARGEST_START, LARGEST_START)
 
     @property
     def registered(self) -> StatisticalModel:
@@ -198,10 +186,10 @@ class Mechanism(StatisticalModel):
         return placed(z)[0], z
 
 
-def moved_by(D: Float[ndarray, "r k 4 4"], points: Float[ndarray, "r 3"]) -> Float32[ndarray, "r 3 k"]:
+def moved_by(D: Float[ndarray, "*r k _ 4"], points: Float[ndarray, "*r 3"]) -> Float32[ndarray, "*r 3 k"]:
     """Motion of points, at rest, with each number, by the derivatives of their segments' motions."""
-    turned: ndarray = np.einsum("rkij,rj->rik", D[..., :3, :3], points) + D[..., :3, 3].transpose(0, 2, 1)
-    return turned.astype(np.float32)
+    turned = np.einsum("...kij,...j->...ik", D[..., :3, :3], points) + np.swapaxes(D[..., :3, 3], -1, -2)
+    return np.asarray(turned, dtype=np.float32)
 
 
 def joints_alone(scene: Scene | None) -> RandomMotion | None:
