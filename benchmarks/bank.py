@@ -64,14 +64,13 @@ CELLS = 48
 FAR = 2.5
 """Distance, in scene units, up to which an observed point is compared along its line of sight."""
 
-FITTED = ("fitted", "shaken", "explored", "noisy", "heavier")
+FITTED = ("fitted", "shaken", "noisy", "heavier")
 """Stages of the fits of the modes. Besides there are "screened" and "bent", which are kept and not measured, "rest" and
 "draws", "settled" and "draws settled", the ends under noise, and "truth", the model's own nearest to the true state,
 with "from truth", the fit that starts there."""
 
 WITHIN: dict[str, str] = {
     "shaken": "shaken",
-    "explored": "explored",
     "in_problem": "noisy",
     "with_heavier_cloud": "heavier",
     "fit_rest": "rest",

@@ -11,7 +11,7 @@ from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.config import FitConfig, TrackConfig
+from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates
@@ -24,7 +24,6 @@ from mereo.fitting.registration.recognition import recognize
 from mereo.fitting.registration.register import ModesFit, is_drawn
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import rotations
-from mereo.fitting.tracking import PAUSE_S, Track, explore
 from mereo.geometry.transforms import transform_points
 from mereo.models.weights import load_model
 from mereo.scenes.random_states import build_model, interior_nodes, sample_states, state_points
@@ -274,17 +273,3 @@ def test_states_near_one_tell_of_it_where_they_lie_on_a_curved_set_and_not_where
     assert not are_near(replace(robot, library=scattered))
     nearest = Prior.near(robot, robot.library[7].astype(np.float64), 0).center
     assert np.abs(Prior.near(robot, robot.library[7].astype(np.float64), 1).center - nearest).max() > 0
-
-
-def test_a_track_looks_for_other_states_where_it_is_wrong_and_not_again_at_once(robot: StatisticalModel) -> None:
-    problem, wrong = stuck(robot, 4, 5)
-    fitted = ModesFit(problem, 1.0, wrong.posed, 0.0)
-    track = Track.of(fitted, 0.0, TrackConfig(), FitConfig())
-    better, after = explore(track, fitted, 1.0)
-    left = problem.misfit(better.posed).cloud
-    assert left < 0.5 * wrong.misfit.cloud and (after.explored_s, after.left) == (1.0, pytest.approx(left))
-    assert explore(after, fitted, 1.0 + 0.9 * PAUSE_S)[0] is fitted
-    assert explore(after, fitted, 1.0 + PAUSE_S)[1].explored_s > 1.0, "a wrong state again"
-    assert explore(replace(after, left=wrong.misfit.cloud), fitted, 9.0)[0] is fitted, "nothing better was found"
-    right = replace(fitted, posed=shaken(problem, wrong).posed)
-    assert explore(track, right, 1.0) == (right, track)

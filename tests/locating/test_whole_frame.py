@@ -118,6 +118,8 @@ def test_an_object_among_others_is_known_at_its_place(
     true = transform_points(PLACED, rest.segments[0].vertices)
     assert_allclose(transform_points(found.pose, long), true, atol=2e-3)
     assert found.seen.cloud.points[:, 2].max() < 0.65, "neither the desk behind it nor the wall is taken for it"
+    spent = found.reconstruction.timings_s
+    assert spent["fit"] == found.seconds, "with the looking, not of the last fit alone"
 
 
 def test_the_covariance_of_a_rigid_objects_pose_is_that_of_its_points(found: mereo.Result) -> None:

@@ -140,10 +140,11 @@ def reconstruct_file(input: AnyPath, output: AnyPath, job: FrameJob) -> Result:
     ``find_object`` and ``reconstruct`` do, and ``ValueError`` for ``carry`` without a registration.
     """
     job.check()
+    started = time.perf_counter()
     with shown_stages(), new_directory(output, job.command.force, [input, *job.read]) as directory:
         result = reconstruct_frame(read_frame(input, job.command.reading), directory, job, Path(input).absolute())
     print_segments(result)
-    print(written(output, result.reconstruction.seconds))
+    print(written(output, time.perf_counter() - started))
     return result
 
 

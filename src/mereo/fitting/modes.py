@@ -3,8 +3,7 @@
 1. Cloud, silhouette and free space, from wide to narrow.
 2. The same again under the Gaussian of the library's states near the answer: states lie on curved sets, of which it is
    the tangent.
-3. While the cloud is not explained, other states of the library and around the best fit, where the states lie on a
-   curved set at all.
+3. While the cloud is not explained, other states around the best fit, where the states lie on a curved set at all.
 """
 
 from dataclasses import dataclass, replace
@@ -18,9 +17,7 @@ from mereo.fitting.problem.problem import Misfit, Problem
 from mereo.fitting.problem.residuals import Prior, Surface
 from mereo.fitting.problem.segments import (
     corner_positions,
-    different,
     diverse_rows,
-    largest_distance,
     rms_distance,
 )
 from mereo.geometry.transforms import best_rotations, fit_rigid
@@ -40,19 +37,6 @@ def refined(problem: Problem, posed: Posed) -> "ScoredFit":
 def has_many_optima(problem: Problem) -> bool:
     """Whether many distances are kept, so that the states lie on a curved set; smooth bending has one optimum."""
     return len(problem.model.pairs) >= 300
-
-
-def explored(problem: Problem, best: "ScoredFit") -> "ScoredFit":
-    """Try states that agree with a fit in most points, while the best does not explain the cloud."""
-    for _ in range(2 * has_many_optima(problem)):
-        if best.explains(problem):
-            break
-        before = best
-        for other in find_candidates(problem, best.posed):
-            best = best.better(problem, refine(problem, other, 1.0, 8))
-        if best is before:
-            break
-    return best
 
 
 SHAKES, SHAKEN = 8, 12
@@ -137,18 +121,6 @@ class ScoredFit:
         return scored if scored.misfit.total < self.misfit.total else self
 
 
-def find_candidates(problem: Problem, best: Posed) -> list[Posed]:
-    """Find two other states that may explain the frame: screen by few points, refine a little, screen again."""
-    coarse, sigma = problem.coarse, REFINE_SIGMA * problem.model.half
-    screened = list[Posed]()
-    for group in (similar_states(problem, best, 12), problem.joints.others(best, 4)):
-        screened += sorted(group, key=lambda other: coarse.screen(other, sigma).total)[:8]
-    # those that differ from ``best`` and from all before them: from alike starts a fit ends alike
-    drawn = [best, *(refine(coarse, other, 2.0, 4) for other in screened)]
-    rows = diverse_rows(corner_positions(problem.model, drawn), ALIKE * problem.model.half, largest_distance)[1:]
-    return sorted((drawn[row] for row in rows), key=lambda other: problem.screen(other, sigma).total)[:2]
-
-
 def fit_wide(problem: Problem, posed: Posed) -> Posed:
     """Fit from a state that may be far off, under the prior of all states."""
     return fit_cloud(problem, posed, Prior.whole(problem.model), problem.config.start_sigma, 15, PAIR_SLACK)
@@ -171,10 +143,7 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
     return posed
 
 
-# --- states of the library from which a fit may start -----------------------------------------------------------------
-
-ALIKE = 0.03
-"""Tolerance, of half the rest box's longest side: points nearer than this agree."""
+# --- poses of many shapes at once -----------------------------------------------------------------
 
 
 def robust_poses(
@@ -196,24 +165,6 @@ def robust_poses(
     cost = squared / (sigma**2 + squared) @ (weight / weight.sum())
     translation = goal - np.matmul(center, rotation.transpose(0, 2, 1))
     return cost, rotation.astype(np.float64), translation[:, 0].astype(np.float64)
-
-
-def similar_states(problem: Problem, posed: Posed, count: int) -> list[Posed]:
-    """Return states of the library that agree with a fit in most points and differ from each other in the rest.
-
-    A wheel that is seen on one side only may be half a turn off, or a finger taken for the other.
-    """
-    model = problem.model
-    goal = model.material(posed.z)[model.sparse].astype(np.float32)
-    equal = np.ones(len(goal), dtype=np.float32)
-    cost, rotation, translation = robust_poses(model.sparse_library, goal, equal, ALIKE * model.half)
-    alike = np.argsort(cost)[:80]
-    rotation, translation = rotation[alike], translation[alike]
-    shapes = np.matmul(model.sparse_library[alike], rotation.transpose(0, 2, 1)) + translation[:, None]
-    shapes = shapes.reshape(len(alike), -1)
-    chosen = [0, *different(shapes, shapes[0], min(count, len(shapes)) - 1)]
-    shift, z = posed.place(translation), model.library[alike].astype(np.float64)
-    return [Posed(posed.rotation @ rotation[i], shift[i], z[i], posed.log_scale) for i in chosen]
 
 
 # --- the object at rest -----------------------------------------------------------------------------------------------
@@ -244,10 +195,11 @@ def resting(problem: Problem, modes: ScoredFit) -> ScoredFit | None:
 
     None where the rest pose is none of the object's states.
     """
-    rest, model = fit_rest(problem, modes.posed), problem.model
-    is_rigid = model.count == 0
+    if not problem.model.rests:
+        return None
+    rest, is_rigid = fit_rest(problem, modes.posed), problem.model.count == 0
     is_better = is_rigid or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
-    return rest if model.rests and is_better else None
+    return rest if is_better else None
 
 
 def narrowing(problem: Problem, modes: Posed) -> float:

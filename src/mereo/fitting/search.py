@@ -28,13 +28,11 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes import ALIKE as AGREES
 from mereo.fitting.modes import (
     BENT_APART,
     ScoredFit,
     bend_by_few,
     differing,
-    explored,
     fit_cloud,
     fit_wide,
     refined,
@@ -49,7 +47,7 @@ from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, Sam
 from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
-from mereo.scenes.mechanism import Mechanism, moved_by
+from mereo.scenes.mechanism import Mechanism
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 # --- tables of shapes -------------------------------------------------------------------------------------------------
@@ -87,8 +85,6 @@ class ShapeTables:
     low: Float32[np.ndarray, "q 3"]
     cell: Float32[np.ndarray, " q"]
     nearest: Int32[np.ndarray, "q c"]
-
-    apart = APART
 
     @classmethod
     def of(cls, model: StatisticalModel, z: Float32[np.ndarray, "q k"], surface: SampledSurface) -> "ShapeTables":
@@ -130,9 +126,9 @@ class ShapeTables:
     def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> "Samples":
         """Samples near points of each pose's model frame, and its ``places``."""
         state, places = poses.state[:, None], self.places(poses)
-        sample = self.looked_up(state, seen)
-        still, few_still = (np.empty((*part.shape, 0), dtype=np.float32) for part in (seen, places))
-        return Samples(self.position[state, sample], self.normal[state, sample], still, places, few_still)
+        sample, still = self.looked_up(state, seen), np.zeros((len(seen), 1, 6, 0), dtype=np.float32)
+        owner, few_owner = (np.zeros(part.shape[:2], dtype=int) for part in (seen, places))
+        return Samples(self.position[state, sample], self.normal[state, sample], owner, places, few_owner, still)
 
     def places(self, poses: "Poses") -> Float32[np.ndarray, "n w 3"]:
         """Positions of samples of each pose's state, evenly spread, as many as points that it is compared with."""
@@ -140,13 +136,17 @@ class ShapeTables:
 
 
 class Samples(NamedTuple):
-    """Samples of states, model frame: near points, and evenly spread ones, with their motion by joints' numbers."""
+    """Samples of states, model frame: near points, and evenly spread ones, with the segments that move them.
+
+    ``twists`` are those of the segments, by the joints' numbers; a shape without joints is one segment.
+    """
 
     position: Float32[np.ndarray, "n p 3"]
     normal: Float32[np.ndarray, "n p 3"]
-    motion: Float32[np.ndarray, "n p 3 k"]
+    owner: Int[np.ndarray, "n p"]
     places: Float32[np.ndarray, "n w 3"]
-    places_motion: Float32[np.ndarray, "n w 3 k"]
+    places_owner: Int[np.ndarray, "n w"]
+    twists: Float32[np.ndarray, "n m 6 k"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,47 +156,45 @@ class MechanismTables(ShapeTables):
     Attributes:
         mechanism: it.
         segments: tables of the segments at rest, by their indices; not of those that are too small for a sample.
-        owner, at_rest: segments and positions at rest of samples of the whole, evenly spread.
+        owner, rest, rest_normal: segment, position and normal of each sample at rest, one segment after the other.
     """
 
     mechanism: Mechanism
     segments: Mapping[int, ShapeTables]
-    owner: Int[np.ndarray, " w"]
-    at_rest: Float32[np.ndarray, "w 3"]
-
-    apart = BENT_APART
+    owner: Int[np.ndarray, " s"]
+    rest: Float32[np.ndarray, "s 3"]
+    rest_normal: Float32[np.ndarray, "s 3"]
 
     @classmethod
     def of_joints(cls, states: ShapeTables, surface: SampledMechanism) -> "MechanismTables":
         """Tables of states, and of the segments of samples."""
         mechanism, none = surface.mechanism, np.zeros((1, 0), dtype=np.float32)
-        position, normal = surface.mean[:, 0], unit_rows(cross(surface.mean[:, 1], surface.mean[:, 2]))
-        parts = {int(owner): surface.owner == owner for owner in np.unique(surface.owner)}
+        order = np.argsort(surface.owner, kind="stable")
+        frame, owner = surface.mean[order], surface.owner[order]
+        rest, normal = frame[:, 0], unit_rows(cross(frame[:, 1], frame[:, 2]))
+        parts = {int(each): owner == each for each in np.unique(owner)}
         segments = {
-            owner: ShapeTables.tabulate(none, position[None, rows], normal[None, rows], mechanism.half)
-            for owner, rows in parts.items()
+            each: ShapeTables.tabulate(none, rest[None, rows], normal[None, rows], mechanism.half)
+            for each, rows in parts.items()
         }
-        step = max(1, len(position) // POINTS)
-        few = {"owner": surface.owner[::step], "at_rest": position[::step]}
-        return cls(**vars(states), mechanism=mechanism, segments=segments, **few)
+        return cls(**vars(states), mechanism=mechanism, segments=segments, owner=owner, rest=rest, rest_normal=normal)
 
     def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> Samples:
         """Samples near points of each pose's model frame, of the segments that come nearest, and its ``places``."""
-        T, D = (part.astype(np.float32) for part in self.mechanism.motions(poses.z))
-        first, nearest = np.zeros((len(seen), 1), dtype=int), np.full(seen.shape[:2], np.inf, dtype=np.float32)
-        owner, position, normal = np.zeros(seen.shape[:2], dtype=int), np.empty_like(seen), np.empty_like(seen)
+        T, twists = (part.astype(np.float32) for part in self.mechanism.motions(poses.z))
+        alone, nearest = np.zeros((len(seen), 1), dtype=int), np.full(seen.shape[:2], np.inf, dtype=np.float32)
+        sample, first = np.zeros(seen.shape[:2], dtype=int), 0
         for number, table in self.segments.items():
             local = np.matmul(seen - T[:, number, None, :3, 3], T[:, number, :3, :3])
-            sample = table.looked_up(first, local)
-            offset = local - table.position[0, sample]
+            row = first + table.looked_up(alone, local)
+            offset = local - self.rest[row]
             squared = np.einsum("npi,npi->np", offset, offset)
-            rows = squared < nearest
-            nearest[rows], owner[rows] = squared[rows], number
-            position[rows], normal[rows] = table.position[0, sample[rows]], table.normal[0, sample[rows]]
-        near, few = (owner, position), self._few(poses)
-        turned = np.einsum("npij,npj->npi", _of_segments(T, owner)[..., :3], normal)
-        motion, few_motion = (moved_by(_of_segments(D, owners), rest) for owners, rest in (near, few))
-        return Samples(_placed(T, *near), turned, motion, _placed(T, *few), few_motion)
+            sample = np.where(squared < nearest, row, sample)
+            nearest, first = np.minimum(nearest, squared), first + table.position.shape[1]
+        few = self._few(len(seen))
+        (position, turn), (places, _) = self._placed(T, sample), self._placed(T, few)
+        normal = np.einsum("npij,npj->npi", turn, self.rest_normal[sample])
+        return Samples(position, normal, self.owner[sample], places, self.owner[few], twists)
 
     def near(self, pose: "Poses", count: int, rng: np.random.Generator) -> "Poses":
         """Poses of states near one: all joints turned a little, or one of them anywhere, with most of it in place."""
@@ -217,24 +215,20 @@ class MechanismTables(ShapeTables):
 
     def places(self, poses: "Poses") -> Float32[np.ndarray, "n w 3"]:
         """Positions of samples of each pose's state, evenly spread, as many as points that it is compared with."""
-        return _placed(self.mechanism.motions(poses.z)[0].astype(np.float32), *self._few(poses))
+        return self._placed(self.mechanism.motions(poses.z)[0].astype(np.float32), self._few(len(poses)))[0]
 
-    def _few(self, poses: "Poses") -> tuple[Int[np.ndarray, "n w"], Float32[np.ndarray, "n w 3"]]:
-        few = (len(poses), len(self.owner))
-        return np.broadcast_to(self.owner, few), np.broadcast_to(self.at_rest, (*few, 3))
+    def _few(self, count: int) -> Int[np.ndarray, "n w"]:
+        """Samples, evenly spread, for each of so many poses."""
+        rows = np.arange(len(self.rest))[:: max(1, len(self.rest) // POINTS)]
+        return np.broadcast_to(rows, (count, len(rows)))
 
-
-def _of_segments(parts: Float32[np.ndarray, "n s *k 4 4"], owner: Int[np.ndarray, "n p"]) -> np.ndarray:
-    """Motions of the segments of samples, or their derivatives."""
-    return parts[np.arange(len(owner))[:, None], owner, ..., :3, :]
-
-
-def _placed(
-    T: Float32[np.ndarray, "n s 4 4"], owner: Int[np.ndarray, "n p"], rest: Float32[np.ndarray, "n p 3"]
-) -> Float32[np.ndarray, "n p 3"]:
-    """Positions of samples at rest in states."""
-    each = _of_segments(T, owner)
-    return np.asarray(np.einsum("npij,npj->npi", each[..., :3], rest) + each[..., 3])
+    def _placed(
+        self, T: Float32[np.ndarray, "n m 4 4"], sample: Int[np.ndarray, "n p"]
+    ) -> tuple[Float32[np.ndarray, "n p 3"], Float32[np.ndarray, "n p 3 3"]]:
+        """Positions of samples in states, and how they are turned."""
+        each = T[np.arange(len(sample))[:, None], self.owner[sample], :3]
+        turn = each[..., :3]
+        return np.einsum("npij,npj->npi", turn, self.rest[sample]) + each[..., 3], turn
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
@@ -270,6 +264,9 @@ OUTSIDE = FitConfig.silhouette_weight * SILHOUETTE_VERTICES / FitConfig.cloud_we
 
 NEAR = 0.4
 """Deviation of the states of a mechanism that are tried near another one, in the numbers of all joints."""
+
+AGREES = 0.03
+"""Distance, in half lengths, of samples of such a state from those of the other up to which they agree."""
 
 FARTHEST = 0.5
 """Largest turn of one step, rad, and largest change of the scale's logarithm and of a joint's number."""
@@ -527,7 +524,7 @@ class Screen:
         """The best poses that differ, so many of them."""
         poses = poses.rows(np.argsort(poses.cost))
         places = poses.place(self.tables.places(poses)[:, ::4])
-        return poses.rows(np.array(diverse_rows(places, self.tables.apart * self.half, rms_distance)[:count]))
+        return poses.rows(np.array(diverse_rows(places, APART * self.half, rms_distance)[:count]))
 
     def scored(self, poses: Poses, sigma: float, moves: bool = False) -> Poses:
         """Poses with their costs for a sigma in shares of ``half``, after a rigid step from there if it ``moves`` them.
@@ -541,7 +538,7 @@ class Screen:
     def _step(self, poses: Poses, sigma: float, moves: bool) -> Poses:
         size = np.exp(poses.log_scale)[:, None, None]
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
-        position, normal, motion, few, few_motion = self.tables.met(poses, seen)
+        position, normal, owner, few, few_owner, twists = self.tables.met(poses, seen)
         offset, narrow = seen - position, sigma / size[..., 0]
         facing = self.sight.facing(poses, position, normal)
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
@@ -550,58 +547,64 @@ class Screen:
         outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
         cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
         cost = cost + OUTSIDE * (outside / (1.0 + outside / robust)).mean(axis=1)
-        bent, bends = poses.z[:, : motion.shape[3]], np.arange(7, 7 + motion.shape[3])
+        bent, bends = poses.z[:, : twists.shape[3]], np.arange(7, 7 + twists.shape[3])
         cost = cost + (bent**2).sum(axis=1) / FitConfig.cloud_weight
         poses = replace(poses, cost=cost.astype(np.float32))
         if not moves:
             return poses
         weight = np.where(facing, 1.0 / (1.0 + squared / ROBUST**2) ** 2, 0.0) / len(self.points)
         weight_outside = OUTSIDE / few.shape[1] / (1.0 + outside / robust) ** 2
-        rows = _derivatives(seen, normal, motion)
         toward = np.matmul(direction, poses.rotation)  # in the model's frame, where a sample moves the other way
-        pull = -_derivatives(few, toward, few_motion)
-        across, beyond = np.einsum("npi,npi->np", offset, normal), -amount / size[..., 0]
-        parts = (rows, pull), (across, beyond), (weight, np.where(amount > 0, weight_outside, 0.0))
-        rows, residual, weight = (np.concatenate(part, axis=1) for part in parts)
-        matrix, gradient = _normal_equations(rows, residual, weight)
+        across, beyond = np.einsum("npi,npi->np", offset, normal), amount / size[..., 0]
+        weight_outside = np.where(amount > 0, weight_outside, 0.0)
+        columns = np.concatenate([_across(seen, normal, across), -_across(few, toward, beyond)], axis=2)
+        weights, owners = (np.concatenate(pair, axis=1) for pair in ((weight, weight_outside), (owner, few_owner)))
+        matrix, gradient = _normal_equations(columns, weights, owners, twists)
         matrix[:, bends, bends] += narrow**2 / FitConfig.cloud_weight
         gradient[:, bends] += narrow**2 / FitConfig.cloud_weight * bent
         # with planes alone, poses far away would slide past each other
-        near, pulled = _along(seen, offset, motion, 0.2 * weight[:, : len(self.points)])
+        apart = _along(seen, offset), np.tile(0.2 * weight, 3), np.tile(owner, 3)
+        near, pulled = _normal_equations(*apart, twists)
         return _moved(poses, matrix + near, gradient + pulled, self.scaled)
 
 
-def _derivatives(
-    points: Float[np.ndarray, "n r 3"], across: Float[np.ndarray, "n r 3"], motion: Float[np.ndarray, "n r 3 k"]
-) -> Float[np.ndarray, "n r q"]:
-    """Derivatives of points' distances along directions, by pose, scale and the numbers that move samples from them."""
-    shrunk, moved = np.einsum("nri,nri->nr", points, across), np.einsum("nri,nrik->nrk", across, motion)
-    return np.concatenate([np.cross(points, across), across, -shrunk[..., None], -moved], axis=2)
+# Residuals as columns: seven derivatives by pose and scale, and what is left, of each of r comparisons in a row.
+
+
+def _across(
+    points: Float[np.ndarray, "n r 3"], across: Float[np.ndarray, "n r 3"], residual: Float[np.ndarray, "n r"]
+) -> Float32[np.ndarray, "n 8 r"]:
+    """Columns of points' distances along directions."""
+    (x, y, z), (a, b, c) = np.moveaxis(points, 2, 0), np.moveaxis(across, 2, 0)
+    return np.stack([y * c - z * b, z * a - x * c, x * b - y * a, a, b, c, -(x * a + y * b + z * c), residual], axis=1)
+
+
+def _along(seen: Float[np.ndarray, "n p 3"], offset: Float[np.ndarray, "n p 3"]) -> Float32[np.ndarray, "n 8 r"]:
+    """Columns of points' distances in space from the nearest samples, along one axis after the other."""
+    columns = np.zeros((len(seen), 8, 3, seen.shape[1]), dtype=np.float32)
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        columns[:, j, i], columns[:, k, i], columns[:, 3 + i, i] = seen[..., k], -seen[..., j], 1.0
+        columns[:, 6, i], columns[:, 7, i] = -seen[..., i], offset[..., i]
+    return columns.reshape(len(seen), 8, -1)
 
 
 def _normal_equations(
-    rows: Float[np.ndarray, "n r q"], residual: Float[np.ndarray, "n r"], weight: Float[np.ndarray, "n r"]
+    columns: Float32[np.ndarray, "n 8 r"],
+    weight: Float[np.ndarray, "n r"],
+    owner: Int[np.ndarray, "n r"],
+    twists: Float32[np.ndarray, "n m 6 k"],
 ) -> tuple[Float[np.ndarray, "n q q"], Float[np.ndarray, "n q"]]:
-    weighted = (rows * weight[..., None]).transpose(0, 2, 1)
-    return np.matmul(weighted, rows), np.matmul(weighted, residual[..., None])[..., 0]
+    """Normal equations of pose, scale and joints' numbers: a segment that moves is the pose moved back for its points.
 
-
-def _along(
-    seen: Float[np.ndarray, "n p 3"],
-    offset: Float[np.ndarray, "n p 3"],
-    motion: Float[np.ndarray, "n p 3 k"],
-    weight: Float[np.ndarray, "n p"],
-) -> tuple[Float[np.ndarray, "n q q"], Float[np.ndarray, "n q"]]:
-    """Normal equations of the points' distances in space, from the nearest samples."""
-    rows = np.zeros((*seen.shape, 7 + motion.shape[3]), dtype=np.float32)
-    rows[..., 7:] = -motion
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        rows[:, :, i, j], rows[:, :, i, k] = seen[..., k], -seen[..., j]
-        rows[:, :, i, 3 + i], rows[:, :, i, 6] = 1.0, -seen[..., i]
-    count = len(seen)
-    return _normal_equations(
-        rows.reshape(count, -1, rows.shape[3]), offset.reshape(count, -1), np.repeat(weight, 3, axis=1)
-    )
+    ``owner`` has the segment of each comparison.
+    """
+    count, segments, _, joints = twists.shape
+    moved = np.matmul(twists.transpose(0, 1, 3, 2).reshape(count, segments * joints, 6), columns[:, :6])
+    moved = moved.reshape(count, segments, joints, columns.shape[2])
+    moved = np.take_along_axis(moved, owner[:, None, None], axis=1)[:, 0]
+    columns = np.concatenate([columns[:, :7], -moved, columns[:, 7:]], axis=1)
+    products = np.matmul(columns * weight[:, None], columns.transpose(0, 2, 1))
+    return products[:, :-1, :-1], products[:, :-1, -1]
 
 
 def _moved(poses: Poses, matrix: Float[np.ndarray, "n q q"], gradient: Float[np.ndarray, "n q"], scaled: bool) -> Poses:
@@ -732,8 +735,6 @@ class Trail:
                 break
             fitted.append(refined(self.problem, fit_wide(self.problem, posed)))
         self.fitted += fitted
-        if not self.best.explains(self.problem):
-            self.fitted.append(explored(self.problem, self.best))
         places = corner_positions(self.problem.model, [fit.posed for fit in (self.best, *fitted)])
         near = rms_distance(places[1:] - places[0]) < BENT_APART * self.problem.model.half
         self.is_repeated = int(near.sum()) > 1

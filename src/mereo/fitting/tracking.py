@@ -21,7 +21,6 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig, LocatedBy, TrackConfig, Tracking
-from mereo.fitting.modes import ScoredFit, explored, has_many_optima, refine
 from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, Posed, in_space
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Prior, are_near
@@ -56,7 +55,6 @@ class Track:
         unsure: how far the velocity may be off because little is known yet, scene units per second.
         other_lines: kind of the lines of sight of which a frame says nothing, as it was when the track began.
         area: greatest area of the object that was seen (``area`` of the evidence).
-        left, explored_s: misfit of the cloud that the last exploration left over (``explore``), and when.
     """
 
     problem: Problem
@@ -68,8 +66,6 @@ class Track:
     other_lines: SightKind
     area: float
     calibration: Calibration | None = None
-    left: float = 0.0
-    explored_s: float = -np.inf
 
     @classmethod
     def of(cls, fitted: ModesFit, time_s: float, config: TrackConfig, constants: FitConfig) -> "Track":
@@ -165,27 +161,8 @@ def next_fit(
             partial = fit("unknown")
             whole_misfit, misfit = (end.problem.misfit(end.posed, end.surface).total for end in (fitted, partial))
             fitted = partial if misfit + WHOLE < whole_misfit else fitted
-        fitted, track = explore(track, fitted, time_s)
     fitted = replace(fitted, seconds=time.perf_counter() - started)
     return fitted, followed(track, fitted, time_s, config)
-
-
-WORSE, PAUSE_S, BETTER = 1.2, 0.5, 100.0
-"""Misfit, in that after the last exploration, and time since, for another; its gain, so that nothing still jumps."""
-
-
-def explore(track: Track, fitted: ModesFit, time_s: float) -> tuple[ModesFit, Track]:
-    """Look for other states near a frame's fit that does not explain it: what bends may follow into a wrong one."""
-    problem = fitted.problem
-    if time_s - track.explored_s < PAUSE_S or not has_many_optima(problem):
-        return fitted, track
-    best = ScoredFit.of(problem, fitted.posed)
-    if best.misfit.cloud < WORSE * track.left or best.explains(problem):
-        return fitted, track
-    other = explored(problem, best.better(problem, refine(problem, best.posed)))
-    if other.misfit.total < best.misfit.total - BETTER:
-        best, fitted = other, replace(fitted, posed=other.posed)
-    return fitted, replace(track, left=best.misfit.cloud, explored_s=time_s)
 
 
 def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig) -> Track:

@@ -6,7 +6,9 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, suppress
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "IGL_NUM_THREADS")
 """Threads of OpenMP (and so torch's), two BLAS libraries and libigl, which read these when they are loaded."""
@@ -66,13 +68,15 @@ class SharedLimit:
                 self._held.close()
 
 
-def _blas_limit() -> AbstractContextManager[object]:
-    from threadpoolctl import threadpool_limits
+@cache
+def _libraries() -> Any:
+    """Libraries that compute in threads; looking for them takes a tenth of a tracked frame's time."""
+    from threadpoolctl import ThreadpoolController
 
-    return threadpool_limits(1, "blas")
+    return ThreadpoolController()
 
 
-_BLAS_LIMIT = SharedLimit(_blas_limit)
+_BLAS_LIMIT = SharedLimit(lambda: _libraries().limit(limits=1, user_api="blas"))
 
 
 def limit_blas_threads() -> AbstractContextManager[object]:

@@ -7,7 +7,7 @@ Notation: s segments, k joints that are free, m material points, n states.
 """
 
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -33,14 +33,17 @@ moves with its number."""
 NEARLY = 1e-3
 """Difference, rad, of a turning joint's range from a whole turn up to which it has no limits: its number goes on."""
 
+CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).transpose(0, 2, 1)
+"""``t @ CROSS`` is the matrix by which the cross product with t multiplies."""
+
 Numbers = Float[ndarray, "*n k"]
 """Numbers of the free joints in states."""
 
 Each = Float[ndarray, " *n"]
 """A value for each state."""
 
-Motions = tuple[Float[ndarray, "*n s 4 4"], Float[ndarray, "*n s k 4 4"]]
-"""Rigid motion of each segment from rest in states, and its derivatives by the joints' numbers."""
+Motions = tuple[Float[ndarray, "*n s 4 4"], Float[ndarray, "*n s 6 k"]]
+"""Rigid motion of each segment from rest in states, and its twists by the joints' numbers: turn, then shift."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,16 +98,16 @@ class Mechanism(StatisticalModel):
         return ndtri([self._share(name, z)[0] % 1.0 for name in self.chain.leaders])
 
     @cached_property
-    def _twists(self) -> Float[ndarray, "j 4 4"]:
-        """Twist of each joint: the derivative of its motion by its value, radians or scene units, where that is 0."""
-        twists = np.zeros((len(self.chain.joints), 4, 4))
-        for twist, (joint, _) in zip(twists, self.chain.joints.values(), strict=True):
-            axis = unit(joint.axis)
-            if joint.turns:
-                twist[:3, :3], twist[:3, 3] = np.cross(np.eye(3), axis), np.cross(joint.pivot, axis)
-            else:
-                twist[:3, 3] = axis
-        return twists
+    def _twists(self) -> tuple[Float[ndarray, "j 6"], Float[ndarray, "j 4 4"]]:
+        """Twist of each joint: the derivative of its motion by its value, radians or scene units, where that is 0.
+
+        As a turn and a shift, and as a matrix.
+        """
+        joints = [(joint.turns, unit(joint.axis), joint.pivot) for joint, _ in self.chain.joints.values()]
+        twists = [(*axis, *np.cross(at, axis)) if turns else (0.0, 0.0, 0.0, *axis) for turns, axis, at in joints]
+        vectors, matrices = np.reshape(twists, (-1, 6)), np.zeros((len(joints), 4, 4))
+        matrices[:, :3, :3], matrices[:, :3, 3] = np.cross(np.eye(3), vectors[:, None, :3]), vectors[:, 3:]
+        return vectors, matrices
 
     def _share(self, name: str, z: Numbers) -> tuple[Each, Each]:
         """Share, of what a joint has of its range, at which it is, and the derivative by its number."""
@@ -118,10 +121,15 @@ class Mechanism(StatisticalModel):
         return np.asarray(ndtr(number)), np.asarray(np.exp(-(number**2) / 2) / np.sqrt(2 * np.pi))
 
     def motions(self, z: Numbers) -> Motions:
-        """Motions of all segments in states."""
-        before, count = z.shape[:-1], len(self.vertex_counts)
-        T, D = np.tile(np.eye(4), (*before, count, 1, 1)), np.zeros((*before, count, len(self.free), 4, 4))
-        for twist, (joint, members) in zip(self._twists, self.chain.joints.values(), strict=True):
+        """Motions of all segments in states; a step of a fit asks for those of its state several times."""
+        return self._motions(np.asarray(z, dtype=float).tobytes(), z.shape[:-1])
+
+    @lru_cache(maxsize=8)  # noqa: B019 (a few states of a few mechanisms)
+    def _motions(self, numbers: bytes, before: tuple[int, ...]) -> Motions:
+        z = np.frombuffer(numbers).reshape(*before, len(self.free))
+        count = len(self.vertex_counts)
+        T, twists = np.tile(np.eye(4), (*before, count, 1, 1)), np.zeros((*before, count, 6, len(self.free)))
+        for vector, twist, (joint, members) in zip(*self._twists, self.chain.joints.values(), strict=True):
             name, rows, (first, last) = joint.follows or joint.name, list(members), joint.limits
             (low, high), (share, slope) = self.chain.joints[name][0].shares, self._share(name, z)
             value = (first + (low + share * (high - low)) * (last - first))[..., None, None]
@@ -129,11 +137,11 @@ class Mechanism(StatisticalModel):
             sine, rest = (np.sin(value), 1.0 - np.cos(value)) if joint.turns else (value, 0.0 * value)
             step = np.eye(4) + sine * twist + rest * (twist @ twist)
             T[..., rows, :, :] = step[..., None, :, :] @ T[..., rows, :, :]
-            D[..., rows, :, :, :] = step[..., None, None, :, :] @ D[..., rows, :, :, :]
+            turned = _of_twists(step)[..., None, :, :] @ twists[..., rows, :, :]
             if name in self.free:
-                rate = (slope * (high - low) * (last - first))[..., None, None, None]
-                D[..., rows, self.free.index(name), :, :] += rate * (twist @ T[..., rows, :, :])
-        return T, D
+                turned[..., self.free.index(name)] += (slope * (high - low) * (last - first))[..., None, None] * vector
+            twists[..., rows, :, :] = turned
+        return T, twists
 
     def material(self, z: PerMode) -> MaterialPoints:
         """Positions of all material points, unposed."""
@@ -150,7 +158,7 @@ class Mechanism(StatisticalModel):
 
     def tangent(self, z: PerMode, rows: Rows = slice(None)) -> Float32[ndarray, "r 3 k"]:
         """Motion of some material points for one standard deviation of each number, at a state."""
-        return moved_by(self.motions(z)[1][self.labels[rows] - 1], self.rest_points[rows])
+        return moved_by(self.motions(z)[1][self.labels[rows] - 1], self.positions(z[None], rows)[0])
 
     @cached_property
     def rest_z(self) -> PerMode:
@@ -186,10 +194,17 @@ class Mechanism(StatisticalModel):
         return placed(z)[0], z
 
 
-def moved_by(D: Float[ndarray, "*r k _ 4"], points: Float[ndarray, "*r 3"]) -> Float32[ndarray, "*r 3 k"]:
-    """Motion of points, at rest, with each number, by the derivatives of their segments' motions."""
-    turned = np.einsum("...kij,...j->...ik", D[..., :3, :3], points) + np.swapaxes(D[..., :3, 3], -1, -2)
-    return np.asarray(turned, dtype=np.float32)
+def _of_twists(T: Float[ndarray, "*n 4 4"]) -> Float[ndarray, "*n 6 6"]:
+    """Matrix that moves twists as a rigid motion moves points."""
+    R, moves = T[..., :3, :3], np.zeros((*T.shape[:-2], 6, 6))
+    moves[..., :3, :3] = moves[..., 3:, 3:] = R
+    moves[..., 3:, :3] = (T[..., :3, 3] @ CROSS.reshape(3, 9)).reshape(R.shape) @ R
+    return moves
+
+
+def moved_by(twists: Float[ndarray, "r 6 k"], points: Float[ndarray, "r 3"]) -> Float32[ndarray, "r 3 k"]:
+    """Motion of points with each number, by the twists of their segments."""
+    return np.asarray(np.cross(twists[:, :3], points[..., None], axis=1) + twists[:, 3:], dtype=np.float32)
 
 
 def joints_alone(scene: Scene | None) -> RandomMotion | None:

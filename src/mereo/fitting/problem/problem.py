@@ -40,7 +40,6 @@ from mereo.fitting.problem.residuals import (
     robust_square,
     silhouette_losses,
 )
-from mereo.fitting.problem.segments import Joints
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 COARSE = 3
@@ -137,7 +136,7 @@ class Problem:
     def changed(self, **changes: Any) -> "Problem":
         """A problem of the same model, with what this one has prepared of the model's surface."""
         other = replace(self, **changes)
-        vars(other).update({name: vars(self)[name] for name in ("pairs", "samples", "joints") if name in vars(self)})
+        vars(other).update({name: vars(self)[name] for name in ("pairs", "samples") if name in vars(self)})
         return other
 
     # what depends on the noise
@@ -286,15 +285,10 @@ class Problem:
         return SampledSurface.of(self.model, self.config.samples)
 
     @cached_property
-    def joints(self) -> Joints:
-        """Joints of the model."""
-        return Joints.of(self.model)
-
-    @cached_property
     def coarse(self) -> "Problem":
         """Problem with fewer points, for the choice among many states."""
         few = self.config.silhouette_vertices // COARSE
-        config = replace(self.config, samples=1000, silhouette_vertices=few)
+        config = replace(self.config, samples=1000, silhouette_vertices=few, exact_steps=0)
         some = slice(None, None, COARSE)
         coarse = replace(self, evidence=self.evidence.few(OBSERVED_SAMPLES // COARSE), config=config)
         vars(coarse)["pairs"] = PairTerm(*(part[some] for part in vars(self.pairs).values()))

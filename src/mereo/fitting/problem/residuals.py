@@ -108,7 +108,9 @@ class SampledMechanism(SampledSurface):
 
     def tangent(self, z: Float[np.ndarray, " k"], rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
         """Motion of the positions of some samples for one standard deviation of each joint's number, at a state."""
-        return moved_by(self.mechanism.motions(z)[1][self.owner[rows]], self.mean[rows, 0])
+        T, twists = (part[self.owner[rows]] for part in self.mechanism.motions(z))
+        placed = np.einsum("rij,rj->ri", T[:, :3, :3], self.mean[rows, 0]) + T[:, :3, 3]
+        return moved_by(twists, placed)
 
 
 @dataclass(frozen=True, eq=False)

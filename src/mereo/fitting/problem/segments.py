@@ -23,73 +23,7 @@ from mereo.geometry.mesh import Segment
 from mereo.geometry.transforms import best_rotations, fit_rigid
 from mereo.scenes.statistical_model import StatisticalModel
 
-# --- joints -----------------------------------------------------------------------------------------------------------
-
-# Segments that touch form a tree. One branch of it is moved as the library moves it there, and the rest stays: a hand
-# half a turn round, with the arm as it is, which random states hardly ever hold.
-
-
-@dataclass(frozen=True, eq=False)
-class Joints:
-    """Joints of an object: which segments hang on which, and how states move them.
-
-    Attributes:
-        corners: material points of each segment.
-        branches: as ``branches`` finds them.
-        rotation, translation: of each segment in some states, from the mean: ``y = R x + t``.
-    """
-
-    model: StatisticalModel
-    corners: Int[np.ndarray, "s c"]
-    branches: tuple[tuple[int, int, Bool[np.ndarray, " s"]], ...]
-    rotation: Float[np.ndarray, "n s 3 3"]
-    translation: Float[np.ndarray, "n s 3"]
-
-    @classmethod
-    def of(cls, model: StatisticalModel) -> "Joints":
-        """Joints of a model's library."""
-        corners = corners_of(model)
-        rotation, translation = segment_poses(model.mean[corners], sampled_positions(model, corners))
-        return cls(model, corners, branches(model), rotation, translation)
-
-    def others(self, posed: Posed, each: int) -> list[Posed]:
-        """Make states that differ from one in a single joint, ``each`` of every joint, as different as there are."""
-        corners = positions(self.model, self.corners, posed.z[None].astype(np.float32))
-        rotation, translation = segment_poses(self.model.mean[self.corners], corners)
-        shapes_of_branches = [np.empty((0, self.corners.size, 3))]
-        for fixed, hanging, moving in self.branches:
-            # the hanging segment's pose in the fixed one's frame, in each state of the library and here
-            inverse = self.rotation[:, fixed].transpose(0, 2, 1)
-            turn = rotation[0, fixed] @ inverse @ self.rotation[:, hanging] @ rotation[0, hanging].T
-            offset = self.translation[:, hanging] - self.translation[:, fixed]
-            shift = (rotation[0, fixed] @ inverse @ offset[..., None])[..., 0] + translation[0, fixed]
-            shift = shift - (turn @ translation[0, hanging])
-            shapes = np.broadcast_to(corners, (len(turn), *corners.shape[1:])).copy()
-            branch = corners[0, moving].reshape(-1, 3)
-            moved = branch @ turn.transpose(0, 2, 1) + shift[:, None]
-            shapes[:, moving] = moved.reshape(len(turn), -1, *corners.shape[2:])
-            apart = different(moved.reshape(len(turn), -1), branch.ravel(), each)
-            shapes_of_branches.append(shapes[apart].reshape(-1, self.corners.size, 3))
-        return self._expressed(np.concatenate(shapes_of_branches), posed)
-
-    def _expressed(self, shapes: Float[np.ndarray, "n p 3"], posed: Posed) -> list[Posed]:
-        """Find the states nearest to shapes of the corners in the frame of ``posed``'s modes."""
-        flat = self.model.modes[self.corners.ravel()].reshape(-1, self.model.count).astype(np.float64)
-        normal = flat.T @ flat
-        normal += 1e-3 * np.trace(normal) / max(1, len(normal)) * np.eye(len(normal))
-        solve = np.linalg.solve(normal, flat.T)
-        mean = self.model.mean[self.corners.ravel()]
-        fitted = np.broadcast_to(mean, shapes.shape)
-        goal = shapes.mean(axis=1, keepdims=True)
-        for _ in range(3):
-            middle = fitted.mean(axis=1, keepdims=True)
-            rotation = best_rotations(np.matmul((fitted - middle).transpose(0, 2, 1), shapes - goal))
-            unposed = np.matmul(shapes - goal, rotation) + middle
-            z = (unposed - mean).reshape(len(shapes), mean.size) @ solve.T
-            fitted = mean + (z @ flat.T).reshape(shapes.shape)
-        translation = (goal - middle @ rotation.transpose(0, 2, 1))[:, 0]
-        shift = posed.place(translation)
-        return [Posed(posed.rotation @ rotation[i], shift[i], z[i], posed.log_scale) for i in range(len(z))]
+# --- corners, and segments that touch ---------------------------------------------------------------------------------
 
 
 def corners_of(model: StatisticalModel) -> Int[np.ndarray, "s c"]:
@@ -159,23 +93,9 @@ def diverse_rows(
     return kept
 
 
-def largest_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
-    """Length of the longest offset of each row."""
-    return np.asarray(np.linalg.norm(offset, axis=2).max(axis=1))
-
-
 def rms_distance(offset: Float[np.ndarray, "m p 3"]) -> Float[np.ndarray, " m"]:
     """Root mean square length of the offsets of each row."""
     return np.sqrt((offset**2).sum(axis=2).mean(axis=1))
-
-
-def different(shapes: Float[np.ndarray, "n q"], first: Float[np.ndarray, " q"], count: int) -> Int[np.ndarray, " m"]:
-    """Rows farthest from ``first``, then each time the one farthest from all before it."""
-    distance, chosen = ((shapes - first) ** 2).sum(axis=1), []
-    for _ in range(min(count, len(shapes))):
-        chosen.append(int(distance.argmax()))
-        distance = np.minimum(distance, ((shapes - shapes[chosen[-1]]) ** 2).sum(axis=1))
-    return np.array(chosen, dtype=np.int64)
 
 
 # --- symmetries -------------------------------------------------------------------------------------------------------
