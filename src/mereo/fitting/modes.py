@@ -15,11 +15,7 @@ from jaxtyping import Float, Float32
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed
 from mereo.fitting.problem.problem import Misfit, Problem
 from mereo.fitting.problem.residuals import Prior, Surface
-from mereo.fitting.problem.segments import (
-    corner_positions,
-    diverse_rows,
-    rms_distance,
-)
+from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import best_rotations, fit_rigid
 
 REFINE_SIGMA = 0.02
@@ -143,7 +139,7 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
     return posed
 
 
-# --- poses of many shapes at once -----------------------------------------------------------------
+# --- poses of many shapes at once -------------------------------------------------------------------------------------
 
 
 def robust_poses(

@@ -598,11 +598,9 @@ def _normal_equations(
 
     ``owner`` has the segment of each comparison.
     """
-    count, segments, _, joints = twists.shape
-    moved = np.matmul(twists.transpose(0, 1, 3, 2).reshape(count, segments * joints, 6), columns[:, :6])
-    moved = moved.reshape(count, segments, joints, columns.shape[2])
-    moved = np.take_along_axis(moved, owner[:, None, None], axis=1)[:, 0]
-    columns = np.concatenate([columns[:, :7], -moved, columns[:, 7:]], axis=1)
+    moved = (np.matmul(-twist, columns[:, :6]) for twist in np.moveaxis(twists, 3, 0))  # by each number, each segment
+    of_numbers = (np.take_along_axis(each, owner[:, None], axis=1) for each in moved)
+    columns = np.concatenate([columns[:, :7], *of_numbers, columns[:, 7:]], axis=1)
     products = np.matmul(columns * weight[:, None], columns.transpose(0, 2, 1))
     return products[:, :-1, :-1], products[:, :-1, -1]
 
