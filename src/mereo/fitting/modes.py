@@ -122,10 +122,10 @@ def fit_wide(problem: Problem, posed: Posed) -> Posed:
     return fit_cloud(problem, posed, Prior.whole(problem.model), problem.config.start_sigma, 15, PAIR_SLACK)
 
 
-def refine(problem: Problem, posed: Posed, widening: float = 1.0, steps: int = 10) -> Posed:
+def refine(problem: Problem, posed: Posed) -> Posed:
     """Fit from nearby, under the prior of the library's 50 states nearest to ``posed``."""
     prior = Prior.near(problem.model, posed.z)
-    return fit_cloud(problem, posed, prior, widening * REFINE_SIGMA, steps, 0.0)
+    return fit_cloud(problem, posed, prior, REFINE_SIGMA, 10, 0.0)
 
 
 def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps: int, slack: float) -> Posed:
@@ -143,22 +143,20 @@ def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps:
 
 
 def robust_poses(
-    states: Float32[np.ndarray, "n p 3"],
-    target: Float32[np.ndarray, "p 3"],
-    weight: Float32[np.ndarray, " p"],
-    sigma: float,
+    states: Float32[np.ndarray, "n p 3"], target: Float32[np.ndarray, "p 3"], sigma: float
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 3 3"], Float[np.ndarray, "n 3"]]:
     """Fit robust rigid poses of many shapes at once to the same points: cost in 0..1, rotations, translations."""
-    share = np.broadcast_to(weight / weight.sum(), states.shape[:2])
+    equal = np.full(len(target), 1 / len(target), dtype=np.float32)
+    share = np.broadcast_to(equal, states.shape[:2])
     for _ in range(4):
         center, goal = np.matmul(share[:, None], states), (share @ target)[:, None]
         covariance = np.matmul((states - center).transpose(0, 2, 1) * share[:, None], target - goal)
         rotation = best_rotations(covariance)
         squared = ((np.matmul(states - center, rotation.transpose(0, 2, 1)) + goal - target) ** 2).sum(axis=2)
         scale = np.maximum(np.median(squared, axis=1, keepdims=True), sigma**2)
-        share = weight / (1.0 + squared / scale)
+        share = 1.0 / (1.0 + squared / scale)
         share = share / share.sum(axis=1, keepdims=True)
-    cost = squared / (sigma**2 + squared) @ (weight / weight.sum())
+    cost = squared / (sigma**2 + squared) @ equal
     translation = goal - np.matmul(center, rotation.transpose(0, 2, 1))
     return cost, rotation.astype(np.float64), translation[:, 0].astype(np.float64)
 

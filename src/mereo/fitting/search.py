@@ -47,7 +47,7 @@ from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, Sam
 from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
 from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
-from mereo.scenes.mechanism import Mechanism
+from mereo.scenes.mechanism import Mechanism, placed
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 # --- tables of shapes -------------------------------------------------------------------------------------------------
@@ -192,9 +192,9 @@ class MechanismTables(ShapeTables):
             sample = np.where(squared < nearest, row, sample)
             nearest, first = np.minimum(nearest, squared), first + table.position.shape[1]
         few = self._few(len(seen))
-        (position, turn), (places, _) = self._placed(T, sample), self._placed(T, few)
-        normal = np.einsum("npij,npj->npi", turn, self.rest_normal[sample])
-        return Samples(position, normal, self.owner[sample], places, self.owner[few], twists)
+        near, places = self._motions(T, sample), placed(self._motions(T, few), self.rest[few])
+        normal = np.einsum("npij,npj->npi", near[..., :3, :3], self.rest_normal[sample])
+        return Samples(placed(near, self.rest[sample]), normal, self.owner[sample], places, self.owner[few], twists)
 
     def near(self, pose: "Poses", count: int, rng: np.random.Generator) -> "Poses":
         """Poses of states near one: all joints turned a little, or one of them anywhere, with most of it in place."""
@@ -205,8 +205,7 @@ class MechanismTables(ShapeTables):
         z = np.where(np.arange(count)[:, None] % 2, single, little).astype(np.float32)
         bent = replace(many, z=z)
         target, states = self.places(pose)[0], self.places(bent)
-        equal = np.ones(len(target), dtype=np.float32)
-        _, rotation, translation = robust_poses(states, target, equal, AGREES * self.mechanism.half)
+        _, rotation, translation = robust_poses(states, target, AGREES * self.mechanism.half)
         return replace(
             bent,
             rotation=(many.rotation @ rotation).astype(np.float32),
@@ -215,20 +214,19 @@ class MechanismTables(ShapeTables):
 
     def places(self, poses: "Poses") -> Float32[np.ndarray, "n w 3"]:
         """Positions of samples of each pose's state, evenly spread, as many as points that it is compared with."""
-        return self._placed(self.mechanism.motions(poses.z)[0].astype(np.float32), self._few(len(poses)))[0]
+        few, T = self._few(len(poses)), self.mechanism.motions(poses.z)[0].astype(np.float32)
+        return placed(self._motions(T, few), self.rest[few])
 
     def _few(self, count: int) -> Int[np.ndarray, "n w"]:
         """Samples, evenly spread, for each of so many poses."""
         rows = np.arange(len(self.rest))[:: max(1, len(self.rest) // POINTS)]
         return np.broadcast_to(rows, (count, len(rows)))
 
-    def _placed(
+    def _motions(
         self, T: Float32[np.ndarray, "n m 4 4"], sample: Int[np.ndarray, "n p"]
-    ) -> tuple[Float32[np.ndarray, "n p 3"], Float32[np.ndarray, "n p 3 3"]]:
-        """Positions of samples in states, and how they are turned."""
-        each = T[np.arange(len(sample))[:, None], self.owner[sample], :3]
-        turn = each[..., :3]
-        return np.einsum("npij,npj->npi", turn, self.rest[sample]) + each[..., 3], turn
+    ) -> Float32[np.ndarray, "n p 4 4"]:
+        """Motions of samples, of those of the segments in states."""
+        return T[np.arange(len(sample))[:, None], self.owner[sample]]
 
 
 def medoids(model: StatisticalModel, count: int) -> Int[np.ndarray, " q"]:
@@ -725,7 +723,7 @@ class Trail:
         )
 
     def go_on(self, stage: SearchRound, poses: list[Posed]) -> None:
-        """Fit the candidates of a round that may be the best, and explore from there."""
+        """Fit the candidates of a round that may be the best."""
         ranked = bend_by_few(self.problem, poses, stage.fitted)
         fitted = list[ScoredFit]()
         for cost, posed in ranked[: stage.fitted]:

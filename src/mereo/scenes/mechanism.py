@@ -8,6 +8,7 @@ Notation: s segments, k joints that are free, m material points, n states.
 
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
+from math import prod
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -122,13 +123,14 @@ class Mechanism(StatisticalModel):
 
     def motions(self, z: Numbers) -> Motions:
         """Motions of all segments in states; a step of a fit asks for those of its state several times."""
-        return self._motions(np.asarray(z, dtype=float).tobytes(), z.shape[:-1])
+        before = z.shape[:-1]  # one state is the same alone and in a row
+        T, twists = self._motions(np.asarray(z, dtype=float).tobytes(), prod(before))
+        return T.reshape(*before, *T.shape[1:]), twists.reshape(*before, *twists.shape[1:])
 
     @lru_cache(maxsize=8)  # noqa: B019 (a few states of a few mechanisms)
-    def _motions(self, numbers: bytes, before: tuple[int, ...]) -> Motions:
-        z = np.frombuffer(numbers).reshape(*before, len(self.free))
-        count = len(self.vertex_counts)
-        T, twists = np.tile(np.eye(4), (*before, count, 1, 1)), np.zeros((*before, count, 6, len(self.free)))
+    def _motions(self, numbers: bytes, states: int) -> Motions:
+        z, count = np.frombuffer(numbers).reshape(states, len(self.free)), len(self.vertex_counts)
+        T, twists = np.tile(np.eye(4), (states, count, 1, 1)), np.zeros((states, count, 6, len(self.free)))
         for vector, twist, (joint, members) in zip(*self._twists, self.chain.joints.values(), strict=True):
             name, rows, (first, last) = joint.follows or joint.name, list(members), joint.limits
             (low, high), (share, slope) = self.chain.joints[name][0].shares, self._share(name, z)
@@ -183,15 +185,15 @@ class Mechanism(StatisticalModel):
         turned = np.matmul(goal - goal.mean(axis=0), best_rotations(np.matmul(library.transpose(0, 2, 1), goal)))
         nearest = ((library - turned) ** 2).sum(axis=(1, 2)).argmin()
 
-        def placed(z: PerMode) -> tuple[Transform, MaterialPoints]:
+        def aligned(z: PerMode) -> tuple[Transform, MaterialPoints]:
             points = self.positions(z[None], self.sparse)[0]
             T = fit_rigid(points, goal)
             return T, transform_points(T, points)
 
         z = self.library[nearest].astype(float)
         if self.free:
-            z = least_squares(lambda z: (placed(z)[1] - goal).ravel(), z).x
-        return placed(z)[0], z
+            z = least_squares(lambda z: (aligned(z)[1] - goal).ravel(), z).x
+        return aligned(z)[0], z
 
 
 def _of_twists(T: Float[ndarray, "*n 4 4"]) -> Float[ndarray, "*n 6 6"]:
@@ -200,6 +202,11 @@ def _of_twists(T: Float[ndarray, "*n 4 4"]) -> Float[ndarray, "*n 6 6"]:
     moves[..., :3, :3] = moves[..., 3:, 3:] = R
     moves[..., 3:, :3] = (T[..., :3, 3] @ CROSS.reshape(3, 9)).reshape(R.shape) @ R
     return moves
+
+
+def placed(T: Float[ndarray, "*p 4 4"], rest: Float[ndarray, "*p 3"]) -> Float[ndarray, "*p 3"]:
+    """Positions of points at rest, each after a motion of its own."""
+    return np.asarray(np.einsum("...ij,...j->...i", T[..., :3, :3], rest) + T[..., :3, 3])
 
 
 def moved_by(twists: Float[ndarray, "r 6 k"], points: Float[ndarray, "r 3"]) -> Float32[ndarray, "r 3 k"]:

@@ -387,8 +387,7 @@ def similar_states(problem: DrawsProblem, shape: Shape) -> list[Drawn]:
     states = problem.states
     some = spread(shape.points, 150)
     library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
-    equal = np.ones(len(some), dtype=np.float32)
-    cost = robust_poses(library[:, some], goal, equal, problem.base.first_sigma)[0]
+    cost = robust_poses(library[:, some], goal, problem.base.first_sigma)[0]
     return [states.drawn(states.seeds[row]) for row in np.argsort(cost)[: problem.config.starts]]
 
 

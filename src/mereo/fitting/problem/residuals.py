@@ -20,7 +20,7 @@ from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Row
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.solids import cast_rays, search_tree
 from mereo.geometry.transforms import unit_rows
-from mereo.scenes.mechanism import Mechanism, moved_by
+from mereo.scenes.mechanism import Mechanism, moved_by, placed
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- the surface as samples -------------------------------------------------------------------------------------------
@@ -109,8 +109,7 @@ class SampledMechanism(SampledSurface):
     def tangent(self, z: Float[np.ndarray, " k"], rows: Int[np.ndarray, " r"]) -> Float32[np.ndarray, "r 3 k"]:
         """Motion of the positions of some samples for one standard deviation of each joint's number, at a state."""
         T, twists = (part[self.owner[rows]] for part in self.mechanism.motions(z))
-        placed = np.einsum("rij,rj->ri", T[:, :3, :3], self.mean[rows, 0]) + T[:, :3, 3]
-        return moved_by(twists, placed)
+        return moved_by(twists, placed(T, self.mean[rows, 0]))
 
 
 @dataclass(frozen=True, eq=False)
