@@ -51,7 +51,6 @@ def facts_of(placed: PlacedAnswer, view: View | None) -> dict[str, Any]:
         "believed": placed.is_believed,
         "place": placed.place.outline.nats,
         "known": said.known,
-        "strangeness": said.strangeness,
         "signs": said.facts()["signs"],
         "explained": registration.explained,
         "points": len(placed.answer.seen.cloud),

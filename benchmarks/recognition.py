@@ -4,7 +4,7 @@
                                      [--calibration-views N] [--method modes|auto] [--output FOLDER]
 
 For each object, with its shipped weights, a file of weights, or none (a scene file, meshes): the area under the
-receiver operating characteristic (AUROC) by which ``Recognition.strangeness`` tells N clean views of the object from N
+receiver operating characteristic (AUROC) by which ``Signs.nats`` tells N clean views of the object from N
 views of every other shipped object, from planes and heaps, from balls and random points as large as it is, from two of
 it side by side, from the half of its points on one side, from clouds in another unit than is stated, from states with
 all draws 1.5 times as far (and of those that are believed, how many have an IoU below .7) and, with weights, from its
@@ -42,7 +42,7 @@ from mereo.api.objects import load_object
 from mereo.deformation.maps import Deformation
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame
-from mereo.fitting.registration.recognition import MOST, Recognition
+from mereo.fitting.registration.recognition import Recognition
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import Camera, PointCloud
@@ -149,8 +149,8 @@ def auroc(own: Sequence[float], strange: Sequence[float]) -> float:
     """Probability that a strange frame is stranger than one of the object's, where equal ones count half."""
     if not len(own) or not len(strange):
         return float("nan")
-    ahead = np.subtract.outer(np.asarray(strange), np.asarray(own))
-    return float((ahead > 0).mean() + 0.5 * (ahead == 0).mean())
+    ahead, same = (compare.outer(np.asarray(strange), np.asarray(own)) for compare in (np.greater, np.equal))
+    return float(ahead.mean() + 0.5 * same.mean())
 
 
 def answered(seen: Observation, model: Model | None, registrar: Registrar) -> Answer | Recognition:
@@ -158,7 +158,7 @@ def answered(seen: Observation, model: Model | None, registrar: Registrar) -> An
     try:
         return answer_frame(seen, model, registrar)
     except ValueError as error:  # nothing is found, and no network answers
-        return Recognition(False, str(error), MOST)
+        return Recognition(False, str(error))
 
 
 def recognized(cloud: PointCloud, model: Model | None, registrar: Registrar, unit_m: float | None = 1.0) -> Recognition:
@@ -346,12 +346,17 @@ def calibration_error(model: Model, views: Sequence[tuple[View, PointCloud]]) ->
     return ece_of(*every), ece_of(*every, calibration.scaling)
 
 
+def nats_against(said: Recognition) -> float:
+    """Nats that speak against the object: all of them, where nothing was fitted."""
+    return np.inf if said.signs is None else -said.signs.nats
+
+
 def row(name: str, result: Measured, seconds: float) -> dict[str, Any]:
     """Row of the table: what was measured, in numbers."""
-    own = [each.strangeness for each in result.own["clean"]]
+    own = list(map(nats_against, result.own["clean"]))
     return {
         "object": Path(name).stem,
-        "auroc": [auroc(own, [each.strangeness for each in result.strange[kind]]) for kind in KINDS],
+        "auroc": [auroc(own, list(map(nats_against, result.strange[kind]))) for kind in KINDS],
         "passed": [share(result.strange[kind], True) for kind in KINDS],
         "frames": [len(result.strange[kind]) for kind in KINDS],
         "beyond_wrong": sum(iou < WRONG for iou in result.beyond_iou),

@@ -2,11 +2,11 @@
 
     Model, Scene -object_views-> Answer -measured-> Calibration
 
-Three parts are measured: the network's probabilities, the radii of registrations, and what is usual of recognition.
+Two parts are measured: the network's probabilities, and the radii of registrations.
 """
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -17,21 +17,20 @@ from scipy.special import log_softmax, softmax
 
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_frame
-from mereo.fitting.registration.recognition import CONSERVATIVE, MEASURED, Signs, is_noisy
 from mereo.fitting.registration.register import Registrar, registrar_for
-from mereo.fitting.registration.registration import Registration
+from mereo.fitting.registration.registration import BELIEVED, Registration
 from mereo.geometry.camera import PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import truth_grid
 from mereo.io.progress import progress
-from mereo.models.calibration import Calibration, RadiusFactors, Recognizing, Scaling, Usual
+from mereo.models.calibration import Calibration, RadiusFactors, Scaling
 from mereo.models.model import Model, scaled_array
 from mereo.reconstruction.observation import observe
 from mereo.scenes.registry import load_scene
 from mereo.scenes.scene import Scene
 from mereo.scenes.seeds import TEST_SEED_START, example_rng
 from mereo.scenes.statistical_model import StatisticalModel
-from mereo.synthesis.config import SENSORS, GenerateConfig, Sensor
+from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import sample_view
 from mereo_learning.cases import RegistrationErrors, Reliability, nearest_truth, sample_cells, seen_points
 from mereo_learning.scoring import check_names, trained_scene, true_material
@@ -39,7 +38,7 @@ from mereo_learning.scoring import check_names, trained_scene, true_material
 SEED = 900_000
 """A training seed, whose examples no shipped weights were trained on."""
 
-VIEWS = 48
+VIEWS = 24
 
 LEAST_VIEWS = 8
 
@@ -53,14 +52,16 @@ def calibrate(
     radius_views: int = 0,
     quiet: bool = True,
 ) -> Calibration:
-    """Calibration of a model by views of its scene, clean ones and noisy ones.
+    """Calibration of a model by views of its scene.
+
+    Of noisy views a network sees less: a temperature that covered these would make all others vague.
 
     Args:
         model: the weights; of such without a statistical model only the probabilities are calibrated.
         scene: their scene, its name or its file; by default the built-in one that they were trained on.
-        views: of the object, half of them clean; at least ``LEAST_VIEWS``.
+        views: of the object; at least ``LEAST_VIEWS``.
         seed: a training seed other than that of the weights' examples.
-        radius_views: further clean views for the radii alone, with the scene unit known: of a fit that ends in a wrong
+        radius_views: further views for the radii alone, with the scene unit known: of a fit that ends in a wrong
             state once in twenty, a few views tell nothing.
         quiet: show no progress.
 
@@ -69,27 +70,24 @@ def calibrate(
     if seed >= TEST_SEED_START:
         raise ValueError(f"the seed is {seed}; calibration is part of training: take one below {TEST_SEED_START}")
     if views < LEAST_VIEWS:
-        raise ValueError(f"{views} views are asked for; at least {LEAST_VIEWS} tell anything: 48 are usual")
+        raise ValueError(f"{views} views are asked for; at least {LEAST_VIEWS} tell anything: {VIEWS} are usual")
     if scene is None or isinstance(scene, str):
         scene = load_scene(scene or trained_scene(model))
     check_names(model, scene.rest.names)
     bare = replace(model, calibration=None)
     registrar = None if model.statistical_model is None else registrar_for(bare, "modes", scene)
     more = radius_views if registrar is not None else 0
-    logits, truth, signs = [], [], RecognitionSigns()
+    logits, truth = [], []
     radii = ViewRadii() if registrar is None else ViewRadii(replace(registrar, method="auto"))
     with progress("calibrate", views + more, "views", quiet=quiet) as shown:
         for number, view in enumerate(object_views(scene, views, seed, more)):
             answer = answer_frame(observe(view.seen), bare, registrar, scene_unit=view.scene_unit)
             radii.add(view, answer)
             if number < views:
-                signs.add(answer)
-                # of noisy views the network sees less: a temperature that covered it would make all others vague
-                if view.is_clean:
-                    assert answer.encoded.code is not None
-                    points, labels = sample_cells(truth_grid(view.mesh, CELLS), SAMPLED_CELLS)
-                    logits.append(bare.logits(answer.encoded.code, points))
-                    truth.append(np.minimum(labels, logits[-1].shape[1] - 1).astype(np.uint8))
+                assert answer.encoded.code is not None
+                points, labels = sample_cells(truth_grid(view.mesh, CELLS), SAMPLED_CELLS)
+                logits.append(bare.logits(answer.encoded.code, points))
+                truth.append(np.minimum(labels, logits[-1].shape[1] - 1).astype(np.uint8))
             shown.advance()
     joint, labels = np.concatenate(logits), np.concatenate(truth)
     scaling = fit_scaling(joint, labels)
@@ -99,49 +97,36 @@ def calibrate(
         temperature=scaling.temperature,
         biases=scaling.biases,
         ece=(ece_of(joint, labels), ece_of(joint, labels, scaling)),
-        recognizing=signs.usual(),
         **radii.fields(),
     )
 
 
 # --- views ------------------------------------------------------------------------------------------------------------
 
-CAMERAS: tuple[Sensor, ...] = ("paper", "structured-light", "paper", "time-of-flight")
-"""Cameras of the views, in turn: half of them clean."""
-
 
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
-    """The object in a random state, with its truth, as a camera sees it.
+    """The object in a random state, with its truth, as the paper's camera sees it.
 
     Attributes:
         mesh: the true segments, camera frame, scene units.
         seen: the cloud, in the same.
-        camera: whose errors it has.
-        scene_unit: length of a scene unit in the cloud's unit, 1; None in every other pair of views, which have to
-            find it.
+        scene_unit: length of a scene unit in the cloud's unit, 1; None in every other view, which has to find it.
         material: true positions of a statistical model's material points, or of the first of them.
     """
 
     mesh: SegmentedMesh
     seen: PointCloud
-    camera: Sensor
     scene_unit: float | None
     material: Callable[[StatisticalModel], Float[np.ndarray, "m 3"]]
 
-    @property
-    def is_clean(self) -> bool:
-        """Whether the camera is the paper's."""
-        return self.camera == "paper"
 
-
-def object_views(scene: Scene, count: int, seed: int, clean: int = 0) -> Iterator[CalibrationView]:
-    """Views of a scene, then ``clean`` by the paper's camera, the unit known; view i is made from (seed, i) alone."""
-    for index in range(count + clean):
-        camera = CAMERAS[index % len(CAMERAS)] if index < count else "paper"
-        scene_unit = 1.0 if index // len(CAMERAS) % 2 == 0 or index >= count else None
-        view = sample_view(scene.for_seed(seed), GenerateConfig(sensor=SENSORS[camera]), example_rng(seed, index))
-        yield CalibrationView(view.mesh, view.depth.to_points(), camera, scene_unit, partial(true_material, view))
+def object_views(scene: Scene, count: int, seed: int, more: int = 0) -> Iterator[CalibrationView]:
+    """Views of a scene, then ``more`` with the unit known; view i is made from (seed, i) alone."""
+    for index in range(count + more):
+        scene_unit = 1.0 if index % 2 == 0 or index >= count else None
+        view = sample_view(scene.for_seed(seed), GenerateConfig(), example_rng(seed, index))
+        yield CalibrationView(view.mesh, view.depth.to_points(), scene_unit, partial(true_material, view))
 
 
 # --- probabilities ----------------------------------------------------------------------------------------------------
@@ -243,77 +228,35 @@ class ViewRadii:
 
     Attributes:
         full: registrar that fits the scene's parameters to what the modes were fitted to; None where there is no scene.
-        clean: measurements of fits of the modes, and of the scene's parameters, to clean frames.
+        views: measurements of fits of the modes, and of the scene's parameters.
     """
 
     def __init__(self, full: Registrar | None = None) -> None:
         self.full = None if full is None or full.states_or_none is None else full
-        self.clean: tuple[list[MeasuredRadii], list[MeasuredRadii]] = [], []
+        self.views: tuple[list[MeasuredRadii], list[MeasuredRadii]] = [], []
 
     def add(self, view: CalibrationView, answer: Answer) -> None:
         """Take in a view of the object, answered by its modes."""
         candidate, registration = answer.candidate, answer.registration
-        if candidate is None or candidate.modes is None or registration is None or not view.is_clean:
+        if candidate is None or candidate.modes is None or registration is None:
             return
         full = None if self.full is None else self.full.finish(candidate.modes)
         for kind, fit in enumerate((registration, full)):
-            if fit is not None and fit.accepted and not is_noisy(fit) and (kind == 0 or fit.method == "draws"):
-                self.clean[kind].append(MeasuredRadii.of(view, candidate, fit))
+            if fit is not None and fit.accepted and fit.needed >= BELIEVED and (kind == 0 or fit.method == "draws"):
+                self.views[kind].append(MeasuredRadii.of(view, candidate, fit))
 
     def fields(self) -> dict[str, Any]:
         """Fields of the ``Calibration``: factors of both kinds of fits; none where their views are too few."""
         fields: dict[str, Any] = {}
-        for (scale, misfit), clean in zip(FIELDS, self.clean, strict=True):
-            if len(clean) >= LEAST:
-                factors = factors_of(clean)
+        for (scale, misfit), views in zip(FIELDS, self.views, strict=True):
+            if len(views) >= LEAST:
+                factors = factors_of(views)
                 fields |= {scale: factors.scale, misfit: factors.misfit}
         return fields
 
 
 def factors_of(views: Sequence[MeasuredRadii]) -> RadiusFactors:
-    """Factors by clean views, those that ended in a wrong state included: users meet them."""
+    """Factors by views, those that ended in a wrong state included: users meet them."""
     factors = RadiusFactors(None, float(np.median([view.misfit for view in views])) or None)
     scale = RegistrationErrors.together([view.widened(factors) for view in views]).scale()
     return replace(factors, scale=scale)
-
-
-# --- recognition ------------------------------------------------------------------------------------------------------
-
-TRUSTED = 4
-"""Views from which on their mean and standard deviation are taken; from fewer, the conservative ones."""
-
-
-@dataclass
-class RecognitionSigns:
-    """Signs of registered frames.
-
-    Attributes:
-        clean: of views of the object.
-        noisy: of views of the object by a depth camera.
-    """
-
-    clean: list[Signs] = field(default_factory=list)
-    noisy: list[Signs] = field(default_factory=list)
-
-    def add(self, answer: Answer) -> None:
-        """Take in a frame; one that was not registered has no signs."""
-        if answer.registration is not None and answer.recognition.signs is not None:
-            (self.noisy if is_noisy(answer.registration) else self.clean).append(answer.recognition.signs)
-
-    def usual(self) -> Recognizing | None:
-        """What is usual; None where too few views were registered."""
-        if len(self.clean) < TRUSTED:
-            return None
-        noisy = usual_of(self.noisy) if len(self.noisy) >= TRUSTED else dict(CONSERVATIVE.noisy)
-        return Recognizing(clean=usual_of(self.clean), noisy=noisy)
-
-
-def usual_of(signs: Sequence[Signs]) -> dict[str, Usual]:
-    """What is usual of each sign, from views of the object, robustly; no less wide than for objects without them."""
-    result: dict[str, Usual] = {}
-    for name in MEASURED:
-        values = [each.logarithms[name] for each in signs if name in each.logarithms]
-        if values:
-            low, middle, high = np.quantile(values, [0.16, 0.5, 0.84])
-            result[name] = Usual(mean=float(middle), std=max(float(high - low) / 2, CONSERVATIVE.clean[name].std))
-    return result

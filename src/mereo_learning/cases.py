@@ -18,7 +18,6 @@ from scipy.optimize import minimize_scalar
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from mereo.fitting.problem.problem import NoFit
 from mereo.fitting.registration.answer_frame import answer_frame
 from mereo.fitting.registration.recognition import Known
 from mereo.fitting.registration.register import Registrar
@@ -26,6 +25,7 @@ from mereo.fitting.registration.registration import Registration
 from mereo.fitting.uncertainty import LEVEL, RadiusParts
 from mereo.geometry.brief import counted, listed
 from mereo.geometry.camera import PointCloud
+from mereo.geometry.conventions import NoFit
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import Color
 from mereo.geometry.metrics import (

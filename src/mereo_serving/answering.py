@@ -77,7 +77,6 @@ class Loaded:
     def facts(self) -> dict[str, Any]:
         """What clients may know of the object."""
         model, known = self.model, self.object.segments
-        calibration = None if model is None else model.calibration
         frame = None if self.registrar is None else self.registrar.model.source_frame
         return {
             "name": self.served.name,
@@ -90,7 +89,6 @@ class Loaded:
             "method": "network" if self.registrar is None else self.registrar.method,
             "scene_unit_m": None if frame is None else frame.unit_m,
             "calibrated": model is not None and model.calibrates,
-            "recognition_calibrated": calibration is not None and calibration.recognizing is not None,
             "device": None if model is None else model.device_type,
             "precision": None if model is None else model.working_precision,
         }

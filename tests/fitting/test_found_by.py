@@ -19,7 +19,6 @@ from mereo.fitting.problem.problem import (
     CLEAN,
     SHARED,
     SIGMAS,
-    NoFit,
     is_normal,
     noise_of,
     shared,
@@ -32,6 +31,7 @@ from mereo.fitting.registration.register import ModesFit, Registrar
 from mereo.fitting.search import screen_poses
 from mereo.fitting.uncertainty import ModesOptimum
 from mereo.geometry.camera import PointCloud, SharedNoise
+from mereo.geometry.conventions import NoFit
 from mereo.models.model import Model
 from mereo.models.weights import load_model
 from mereo.reconstruction.observation import observe

@@ -16,7 +16,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from trimesh.remesh import subdivide
 
 from mereo.fitting.draws.playback import DrawnStates
-from mereo.fitting.problem.problem import NoFit
 from mereo.fitting.registration import register
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.answer_frame import answer_frame, search_modes
@@ -31,6 +30,7 @@ from mereo.fitting.registration.register import (
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.tracking import Tracker
 from mereo.geometry.camera import SCANNER_TO_CAMERA, PointCloud
+from mereo.geometry.conventions import NoFit
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.metrics import Scores, confusion_matrix, intersection_over_union
 from mereo.geometry.solids import Solids

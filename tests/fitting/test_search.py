@@ -205,17 +205,17 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
     turned = replace(posed, rotation=posed.rotation @ Rotation.from_euler("y", np.pi).as_matrix())
     others = [ScoredFit.of(problem, each) for each in (turned, posed)]
 
-    def said(worse: float) -> int:
-        misfit = replace(first.misfit, total=first.misfit.total + worse)
+    def said(share: float) -> int:
+        misfit = replace(first.misfit, total=(1.0 + share * (ALIKE - 1.0)) * first.misfit.total)
         fits = [first, *(replace(other, misfit=misfit) for other in others)]
         return len(Trail(problem, 0.0, fits).others)
 
-    assert (said(0.9 * ALIKE), said(1.1 * ALIKE)) == (1, 0)
+    assert (said(0.9), said(1.1)) == (1, 0)
     half_turn = Symmetry(np.eye(4), np.pi, np.array([0.0, 1.0, 0.0]), (0,))
     monkeypatch.setitem(vars(model), "symmetries", (half_turn,))
-    assert said(0.9 * ALIKE) == 1  # where it is bent, it does not look the same
+    assert said(0.9) == 1  # where it is bent, it does not look the same
     others[0] = replace(others[0], surface=first.surface)
-    assert said(0.9 * ALIKE) == 0
+    assert said(0.9) == 0
 
 
 def all_around(model: StatisticalModel, posed: Posed, std: float = 0.05) -> tuple[np.ndarray, np.ndarray]:

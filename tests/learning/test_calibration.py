@@ -103,7 +103,7 @@ def test_the_command_writes_what_was_measured_beside_the_weights(tmp_path: Path,
     told = capsys.readouterr().out
     assert "8 views of the training seed 900000" in told and f"wrote {output}" in told
     found = load_model(output).calibration
-    assert found is not None and found.temperature is not None and found.recognizing is None
+    assert found is not None and found.temperature is not None
     assert found.ece is not None and found.ece[1] < min(0.05, found.ece[0])
     assert run_mereo("weights", "show", output, "--json") == 0
     assert json.loads(capsys.readouterr().out)["calibration"]["views"] == 8
@@ -143,15 +143,15 @@ def measured(off: np.ndarray, misfit: float = 0.1) -> calibration.MeasuredRadii:
     return calibration.MeasuredRadii(errors, misfit)
 
 
-def test_a_scale_is_measured_on_all_clean_views() -> None:
+def test_a_scale_is_measured_on_all_views() -> None:
     rng = default_rng(0)
     right = [measured(rng.normal(size=200)) for _ in range(20)]
     elsewhere = measured(30.0 + rng.random(200))
     views = calibration.ViewRadii()
-    views.clean[0].extend(right[: calibration.LEAST - 1])
+    views.views[0].extend(right[: calibration.LEAST - 1])
     assert views.fields() == {}
     alone = RegistrationErrors.together([one.errors for one in right[: calibration.LEAST]]).scale()
-    views.clean[0].extend([*right[calibration.LEAST - 1 :], elsewhere])
+    views.views[0].extend([*right[calibration.LEAST - 1 :], elsewhere])
     fields = views.fields()
     assert fields["radius_scale"] > 2.2 > 1.96 > alone - 0.3  # 99 % and more of the right ones
     assert fields["usual_misfit"] == 0.1

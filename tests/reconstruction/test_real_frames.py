@@ -18,9 +18,8 @@ from scipy.spatial.transform import Rotation
 
 from mereo.api.objects import load_object
 from mereo.api.reconstruct import Tracker, load_frame, reconstruct
-from mereo.fitting.problem.problem import NoFit
 from mereo.geometry.camera import Camera
-from mereo.geometry.conventions import Pair, Way
+from mereo.geometry.conventions import NoFit, Pair, Way
 from mereo.geometry.mesh import Segment, SegmentedMesh
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.config import InputConfig

@@ -16,7 +16,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from PIL import Image
 from reported_scenes import ball, example, page_data, positions, wall
 
-from mereo.fitting.registration.recognition import MOST, NOT_EVALUATED, Recognition, Signs
+from mereo.fitting.registration.recognition import NOT_EVALUATED, Recognition, Signs
 from mereo.geometry.camera import Camera, DepthImage, PointCloud
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.atomic_files import JsonObject
@@ -201,7 +201,7 @@ NOTHING = "Network alone: nothing says whether this is the object."
 
 
 def recognized(known: bool | str, reason: str | None = None) -> Recognition:
-    return Recognition(known, reason, 5.0, Signs(size=0.01, unexplained=0.2))  # type: ignore[arg-type]
+    return Recognition(known, reason, Signs(size=0.01, unexplained=0.2))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -212,7 +212,7 @@ def recognized(known: bool | str, reason: str | None = None) -> Recognition:
         (recognized(False, "size: unit (-u: m)"), FIT, "no", "Do not trust it: size.", "unit (-u: m)"),
         (recognized(False), FIT, "no", "Do not trust it: it was not recognized.", None),
         (recognized(True), {**FIT, "accepted": False}, "doubt", "Doubtful: it was not recognized.", None),
-        (Recognition(False, "the object is lost", MOST), None, "no", "Do not trust it: the object is lost.", None),
+        (Recognition(False, "the object is lost"), None, "no", "Do not trust it: the object is lost.", None),
         (NOT_EVALUATED, None, "alone", NOTHING, None),
         (None, None, "alone", NOTHING, None),
     ],
@@ -231,7 +231,7 @@ def test_a_verdict_is_one_line_with_its_reason(
 def test_report_summary_and_exit_status_say_the_same(known: bool | str, fit: JsonObject | None) -> None:
     """Only what is known and the model's own answer can be relied on without looking."""
     signs = None if fit is None else Signs(size=0.01, unexplained=0.2)
-    recognition = Recognition(known, None if known is True else "it is bent: look", 5.0, signs)  # type: ignore[arg-type]
+    recognition = Recognition(known, None if known is True else "it is bent: look", signs)  # type: ignore[arg-type]
     summary = {"recognition": recognition.facts(), "registration": fit}
     level, word, _ = page_words(summary, Unit(None))["trust"]
     verdict = trust(summary)

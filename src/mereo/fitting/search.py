@@ -45,6 +45,7 @@ from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, SampledSurface
 from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
+from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
 from mereo.scenes.mechanism import Mechanism, placed
@@ -664,9 +665,12 @@ SIGMAS = (
 RIVAL = 1.5
 """Misfit by few points, in misfits of the best, up to which a candidate may still be as good."""
 
-ALIKE = 12.0
-"""Misfit by which a state may be worse than the best and be the true one with 5 % of its probability, which a quarter
-of the misfit decides: points' errors are not independent (docs/experiments/078.md)."""
+ALIKE = 1.1
+"""Misfit, in misfits of the best state, up to which another one may be the true one: how large errors are, and how many
+of them are independent, is known from what the best leaves over alone (docs/experiments/098.md)."""
+
+SAME, MOST_PLACES = 0.04, 0.95
+"""Distance in half lengths up to which two states look the same, and the share of the places that is so near."""
 
 KEPT = 4
 """Fits that differ, which another problem of the frame begins with."""
@@ -781,16 +785,17 @@ class Trail:
 
     @property
     def others(self) -> tuple[Float[np.ndarray, "m 3"], ...]:
-        """Positions of the material points in other states that explain the frame alike."""
+        """Positions of the material points in other states that explain the frame alike, and do not look the same.
+
+        That a whole, or a segment, looks the same turned is said by its symmetry.
+        """
         model, best = self.problem.model, self.best
-        rivals = sorted((fit for fit in self.fitted if _total(fit) < _total(best) + ALIKE), key=_total)
+        rivals = sorted((fit for fit in self.fitted if _total(fit) <= ALIKE * _total(best)), key=_total)
         rows = differing(self.problem, [fit.posed for fit in rivals], APART)[1:]
-        others = [rivals[row].surface.material for row in rows]
-        # a state that looks the same turned is said by the symmetry, which takes a second to find the first time
-        if others and any(None not in symmetry.lands_on for symmetry in model.symmetries):
-            near, apart = cKDTree(best.surface.material), BENT_APART * model.half
-            others = [each for each in others if near.query(each[model.sparse])[0].mean() > apart]
-        return tuple(others)
+        others, vertices = [rivals[row].surface.material for row in rows], model.silhouette_vertices
+        solids = Solids(model.mesh(best.surface.material))
+        apart = (np.quantile(solids.nearest(each[vertices]).distance, MOST_PLACES) for each in others)
+        return tuple(each for each, far in zip(others, apart, strict=True) if far > SAME * model.half)
 
 
 def search(

@@ -26,7 +26,7 @@ from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Prior, are_near
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
-from mereo.fitting.registration.recognition import MOST, Recognition, recognize
+from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.search import WHOLE
 from mereo.geometry.brief import counted
@@ -465,12 +465,7 @@ class Tracker:
         self._search.drop()
         model = self.registrar.network
         stated = self.registrar.stated_scene_unit(frame.seen.frame.unit_m)
-        recognition = recognize(
-            tracked.fitted.registration,
-            self.registrar.calibration,
-            stated_scene_unit=stated,
-            has_weights=model is not None,
-        )
+        recognition = recognize(tracked.fitted.registration, stated, has_weights=model is not None)
         recognition = recognition.doubted(frame.seen.doubt)
         seen = in_registered_unit(frame.seen, self.registrar, tracked.fitted.registration, recognition)
         return Answer(
@@ -495,7 +490,7 @@ class Tracker:
             registrar=self.registrar,
             hypothesis=Reading.of_all(frame.seen.cloud),
             T_camera_input=self._T_camera_input,
-            recognition=Recognition(False, reason, MOST, has_weights=self.registrar.network is not None),
+            recognition=Recognition(False, reason, has_weights=self.registrar.network is not None),
             located_by="search",
             tracking="lost",
             seconds=time.perf_counter() - started,

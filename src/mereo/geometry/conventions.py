@@ -8,6 +8,10 @@ MIN_POINTS = 32
 """Fewer observed points say too little about an object: they are refused, drawn again, or left as they were."""
 
 
+class NoFit(ValueError):
+    """Frame to which no model can be fitted, for a reason that its sender can mend."""
+
+
 LARGEST = 1e12
 """Coordinate in any unit that is beyond every scan; products of larger ones may be infinite."""
 

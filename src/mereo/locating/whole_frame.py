@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from mereo.fitting.modes import bend_by_few, fit_wide, refined
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.problem import NoFit, Problem
+from mereo.fitting.problem.problem import Problem
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import (
     answer_candidate,
@@ -25,11 +25,11 @@ from mereo.fitting.registration.answer_frame import (
     fit_states,
     scene_unit_of,
 )
-from mereo.fitting.registration.recognition import Known
+from mereo.fitting.registration.recognition import FIT, REFUSED, Known, Signs
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.search import ROUNDS, SearchRound, screen_poses
 from mereo.geometry.camera import DepthImage
-from mereo.geometry.conventions import MIN_POINTS
+from mereo.geometry.conventions import MIN_POINTS, NoFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import Cells, Instances, check_value
 from mereo.io.cores import limit_blas_threads
@@ -48,16 +48,12 @@ QUICK = SearchRound(6, 40, 6, 4)
 LOOKS, ANSWERS = 12, 3
 """Regions that are looked at, and of these how many are answered, at most."""
 
-CHANCE, BENDS, RULED_OUT, STRANGE = -4.0, -0.8, -2.4, -0.036
-"""Nats of an object at a place of a frame where nobody says that it is there; of one that bends, and so can follow
-another thing's outline; of the logarithm of one and the percent of its surface that are ruled out; and of the square of
-its strangeness. By the regression of ``outline.HIT``."""
+CHANCE = -6.5
+"""Nats of an object at a place of a frame where nobody says that it is there, beside those of the outline and of the
+fit: by a logistic regression of training desks, which gives these a weight of one (docs/experiments/098.md)."""
 
-WORTH = 1.0
+WORTH = 2.5
 """Nats that a better state must win at a place to be searched for."""
-
-UNLIKELY = -3.0
-"""Nats below which a frame does not show the object at a place; up to 0 it may."""
 
 NOWHERE = (
     "nothing {} is of the object's size and shape: check both units (--depth-scale, --units), or say "
@@ -169,7 +165,7 @@ class WholeFrame:
         return bool(taken.any()) and 2 * int((each := taken[self.explained(mesh)]).sum()) > len(each)
 
     def problem(self, seen: Observation) -> Problem:
-        """What a fit to the object in the frame works on; raises ``ValueError`` for what none can start from."""
+        """What a fit to the object in the frame works on; raises ``NoFit`` where that is too little."""
         frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
         cloud, registrar = cloud_to_fit(frame, seen.lines, self.unit), self.registrar
         return Problem(registrar.states, cloud.evidence(self.unit), cloud.scale_std, registrar.config)
@@ -185,7 +181,7 @@ class WholeFrame:
         return compare_outline(self.jumps, render_depth(mesh, self.jumps.image.camera).depth)
 
     def look(self, mask: Bool[np.ndarray, "h w"]) -> Place:
-        """Place of a region, with some states that are quickly fitted to it; raises as ``problem``."""
+        """Place of a region, with some states that are quickly fitted to it."""
         problem = self.problem(part_of(self.thin, mask))
         states = bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted)
         ranked = sorted((self.place(mask, [posed]) for _, posed in states), key=lambda place: -place.outline.nats)
@@ -193,17 +189,13 @@ class WholeFrame:
 
     def places(self) -> list[Place]:
         """Places where the object may be, the most evident first."""
-        model, places = self.registrar.model, list[Place]()
+        model = self.registrar.model
         area = self.unit**2 * ConvexHull(model.rest_points).area / 4  # of its shadow, over all directions
         image, first = self.jumps.image, self.every // 2
         kept = self.seen.kept_pixels()[first :: self.every, first :: self.every]
         part = DepthImage(np.where(kept, image.depth, 0.0), image.camera)
-        for mask in islice(filter(self.is_at_point, regions(part, 2 * model.half * self.unit, area)), LOOKS):
-            try:
-                places.append(self.look(mask))
-            except ValueError:
-                continue
-        return sorted(places, key=lambda place: -place.outline.nats)
+        masks = islice(filter(self.is_at_point, regions(part, 2 * model.half * self.unit, area)), LOOKS)
+        return sorted(map(self.look, masks), key=lambda place: -place.outline.nats)
 
     def chosen(self, place: Place) -> Observation:
         """The object with the pixels of the whole image that a place explains, and those of its region near it."""
@@ -225,7 +217,7 @@ class WholeFrame:
         first, *others = place.states
         try:
             problem = self.problem(self.chosen(place))
-        except ValueError:
+        except NoFit:
             return place
         return self.place(place.mask, [refined(problem, fit_wide(problem, first)).posed, *others])
 
@@ -243,7 +235,7 @@ class WholeFrame:
             encoded = encode_frame(seen.readings(keep_all)[0], registrar.starting_network, seen.frame.axes)
             states, matches = () if rounds else place.states, registrar.correspondences(encoded.code)
             candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds, matches)
-        except ValueError:
+        except NoFit:
             return None
         assert candidate.modes is not None
         registration = candidate.modes.registration
@@ -255,7 +247,7 @@ class WholeFrame:
     def finished(self, placed: "PlacedAnswer", keep_all: bool) -> "PlacedAnswer":
         """The same where it may be the object: by pixels that are chosen once more, and with the scene's parameters."""
         modes, model = placed.candidate.modes, placed.answer.model
-        if modes is None or placed.nats < UNLIKELY or placed.is_finished:
+        if modes is None or placed.nats < REFUSED or placed.is_finished:
             return placed
         again = self.answered(self.place(placed.place.mask, [modes.posed]), model, keep_all, ())
         best = placed if again is None else max(placed, again, key=lambda each: each.score)
@@ -304,10 +296,13 @@ def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
 
 def evidence_of(answer: Answer, outline: Outline, stated: float = 0.0) -> float:
     """Nats by which an answer is likelier than something else that was taken for the object; some may be ``stated``."""
-    registration = answer.registration
-    assert registration is not None
-    state = BENDS * (registration.model.count > 0) + STRANGE * answer.recognition.strangeness**2
-    return float(CHANCE + stated + state + RULED_OUT * np.log1p(100 * (registration.ruled_out or 0.0)) + outline.nats)
+    return CHANCE + stated + signs_of(answer).nats + outline.nats
+
+
+def signs_of(answer: Answer) -> Signs:
+    """Signs of a registered answer."""
+    assert answer.recognition.signs is not None
+    return answer.recognition.signs
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,7 +327,7 @@ class PlacedAnswer:
 
     @property
     def nats(self) -> float:
-        """By the outline, and by how strange the state and what is left over are."""
+        """By the outline, and by what the fit leaves over."""
         return evidence_of(self.answer, self.outline)
 
     @property
@@ -348,8 +343,8 @@ class PlacedAnswer:
 
     @property
     def lost(self) -> float:
-        """Nats that a better state may win: those of the strangeness, were it spread as normal numbers."""
-        return 0.5 * self.answer.recognition.strangeness**2
+        """Nats that a better state may win: those that the signs take off."""
+        return FIT - signs_of(self.answer).nats
 
     @property
     def is_believed(self) -> bool:
@@ -426,9 +421,9 @@ def answer_observation(
     with stage("look through the whole frame"), limit_blas_threads():
         frame = WholeFrame.of(seen, registrar)
         best, *others = instances_in(frame, list(answers_in(frame, model, keep_all, most)), keep_all, most)
-    answer = absent(best) if best.nats < UNLIKELY else judged(best.answer, best.outline)
+    answer = absent(best) if best.nats < REFUSED else judged(best.answer, best.outline)
     stated: dict[str, Any] = {"resolution": resolution, "label_points": label_points}
-    further = tuple(replace(each.answer, **stated) for each in others if best.nats >= UNLIKELY)
+    further = tuple(replace(each.answer, **stated) for each in others if best.nats >= REFUSED)
     return replace(answer, **stated, further=further, seconds=time.perf_counter() - started)
 
 
@@ -473,7 +468,7 @@ def judged(answer: Answer, outline: Outline | None, stated: float = 0.0) -> Answ
         f"of it have an edge, {outline.past} inside have seen past it): look at the result before you rely on it, or "
         "take a frame that shows more of its outline"
     )
-    known: Known = False if nats < UNLIKELY else "unsure"
+    known: Known = False if nats < REFUSED else "unsure"
     return replace(answer, recognition=replace(answer.recognition, known=known, reason=reason))
 
 

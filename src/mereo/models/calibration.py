@@ -9,27 +9,6 @@ Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
-class Usual(BaseModel, frozen=True):
-    """Usual logarithm of a sign in views of the object: its mean and its standard deviation."""
-
-    mean: FiniteFloat
-    std: Positive
-
-
-class Recognizing(BaseModel, frozen=True):
-    """What tells the object in learned states from other things and states (``fitting.registration.recognition``).
-
-    Attributes:
-        clean: usual signs of views without noise beyond the paper's.
-        noisy: the same of simulated depth cameras' views.
-
-    Weights may have more signs than are asked.
-    """
-
-    clean: dict[str, Usual]
-    noisy: dict[str, Usual]
-
-
 MISFITTING = 2.0
 """Power of a frame's misfit, over the usual one, by which its radii are wider.
 
@@ -87,7 +66,6 @@ class Calibration(BaseModel, frozen=True):
         biases: added to the divided logits of empty space and each segment (with the temperature: vector scaling, but
             for one temperature of all classes); None where the temperature does alone. Labels do not depend on either.
         ece: expected calibration error of the probabilities as the network gives them, and as they are calibrated.
-        recognizing: what tells the object in learned states from other things and states.
     """
 
     seed: Annotated[int, Field(ge=0)]
@@ -99,7 +77,6 @@ class Calibration(BaseModel, frozen=True):
     temperature: Positive | None = None
     biases: tuple[FiniteFloat, ...] | None = None
     ece: tuple[Share, Share] | None = None
-    recognizing: Recognizing | None = None
 
     def radii(self, *, draws: bool, noisy: bool) -> RadiusFactors:
         """What makes the radii of a fit of draws, or of the modes, to a frame.
@@ -123,7 +100,7 @@ class Calibration(BaseModel, frozen=True):
 def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
     """Calibration in words, each with its title."""
     if calibration is None:
-        return [("calibration", "none: confidences are not calibrated, recognition has values for all objects")]
+        return [("calibration", "none: confidences are not calibrated")]
     rows = [("calibration", f"{calibration.views} views of the training seed {calibration.seed}")]
     if calibration.temperature is not None:
         kind = "a temperature" if calibration.biases is None else "a temperature and a bias for each class"
@@ -134,6 +111,4 @@ def calibration_rows(calibration: Calibration | None) -> list[tuple[str, str]]:
         draws = calibration.draws_radius_scale
         of_draws = "" if draws is None else f", {draws:.2f} of fits of the scene's draws"
         rows.append(("radii", f"the posterior's times {calibration.radius_scale:.2f} of fits of the modes{of_draws}"))
-    if calibration.recognizing is not None:
-        rows.append(("recognition", "features are compared with those of the object's own views"))
     return rows

@@ -13,7 +13,7 @@ import numpy as np
 
 from mereo.geometry.brief import counted
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import MIN_POINTS, Names
+from mereo.geometry.conventions import MIN_POINTS, Names, NoFit
 from mereo.geometry.mesh import Nested, SegmentColors
 from mereo.geometry.transforms import Labels, Normalizer, Points, Rows, Values
 from mereo.models.calibration import Calibration
@@ -121,9 +121,9 @@ class Trained(Protocol):
 
 
 def check_enough(count: int, message: str) -> None:
-    """Raise ``ValueError``, beginning with ``message``, where a reconstruction needs more points than ``count``."""
+    """Raise ``NoFit``, beginning with ``message``, where a reconstruction needs more points than ``count``."""
     if count < MIN_POINTS:
-        raise ValueError(
+        raise NoFit(
             f"{message}; a reconstruction needs at least {MIN_POINTS}: move closer, or check the mask and the depth "
             "range"
         )

@@ -65,10 +65,6 @@ class Misfit:
     total: float
 
 
-class NoFit(ValueError):
-    """Frame to which no model can be fitted, for a reason that its sender can mend."""
-
-
 @dataclass(frozen=True, eq=False)
 class GivenPose:
     """Pose of the object that is known up to an error, as of one that is held.

@@ -16,13 +16,14 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import resting
 from mereo.fitting.problem.correspondences import Correspondences, fit_correspondences
 from mereo.fitting.problem.gauss_newton import Posed
-from mereo.fitting.problem.problem import GivenPose, NoFit, Problem
+from mereo.fitting.problem.problem import GivenPose, Problem
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.recognition import FEATURELESS, Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.fitting.search import MECHANISM_ROUNDS, ROUNDS, Screen, SearchRound, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
+from mereo.geometry.conventions import NoFit
 from mereo.geometry.transforms import fit_rigid, transform_points
 from mereo.io.bounds import Cells, PositiveOrUnknown, check_value
 from mereo.io.cores import limit_blas_threads
@@ -94,10 +95,10 @@ def answer_of(
 ) -> Answer:
     """Make the answer of a candidate, and recognize the object in it."""
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
-    calibration = None if model is None else model.calibration
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
-    doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or None
-    recognition = recognize(registration, calibration, stated, unseen, model is not None).doubted(doubt)
+    ambiguity = None if registration is None else registration.doubt
+    doubt = seen.doubt or (FEATURELESS if candidate.is_featureless else ambiguity)
+    recognition = recognize(registration, stated, unseen, model is not None).doubted(doubt)
     used = candidate.encoded
     if registrar is not None and registration is not None:
         seen = in_registered_unit(seen, registrar, registration, recognition)

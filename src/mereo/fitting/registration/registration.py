@@ -111,6 +111,18 @@ class Registration:
         others = f"; {counted(self.alike - 1, 'other state')} would do so too" if self.alike > 1 else ""
         return f"registered model ({self.method}) explains {self.explained:.1%} of the observed points{others}"
 
+    @property
+    def doubt(self) -> str | None:
+        """Sentence about other states that explain the frame alike, with what to do; None without any."""
+        if self.optimum is None or not self.optimum.others:
+            return None
+        apart = np.linalg.norm(np.stack(self.optimum.others) - self.optimum.surface.material, axis=2)
+        return (
+            f"{counted(len(apart), 'other state')} would explain the frame nearly as well, with places up to "
+            f"{apart.max() * self.optimum.unit:.3g} away in the frame's unit: take a frame from another side, or of "
+            "more of the object"
+        )
+
     @cached_property
     def modes_z(self) -> Float[np.ndarray, " k"]:
         """Coefficients of the modes nearest to the state, whatever describes it."""
