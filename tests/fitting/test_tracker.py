@@ -16,9 +16,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 from mereo.api.result import Result
 from mereo.cli.stream import Answering, Outcome, StreamFrame, SurfaceFolder, line
-from mereo.fitting import tracking
 from mereo.fitting.config import FitConfig, TrackConfig
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
+from mereo.fitting.registration import answer_frame
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.answer_frame import search_hypotheses, search_modes
 from mereo.fitting.registration.register import CloudToFit, Registrar
@@ -155,11 +155,10 @@ def searches(registrar: Registrar, frames: dict[str, Observation], monkeypatch: 
 
     def search(seen: Observation, *_: object) -> Candidate:
         asked.append(seen)
-        is_thing = seen is frames["thing"]
+        is_thing = seen.cloud is frames["thing"].cloud
         return replace(searched(registrar, frames["here"]), modes=None) if is_thing else searched(registrar, seen)
 
-    monkeypatch.setattr("mereo.fitting.registration.answer_frame.search_hypotheses", search)
-    monkeypatch.setattr(tracking, "search_hypotheses", search)
+    monkeypatch.setattr(answer_frame, "search_hypotheses", search)
     return asked
 
 
@@ -242,7 +241,7 @@ def test_what_was_found_must_explain_the_newest_frame(
 def test_the_own_thread_blocks_no_frame_and_ends(
     registrar: Registrar, frames: dict[str, Observation], searches: Searches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    waiting, goes_on, search = threading.Event(), threading.Event(), tracking.search_hypotheses
+    waiting, goes_on, search = threading.Event(), threading.Event(), answer_frame.search_hypotheses
 
     def slow(seen: Observation, *rest: Any) -> Candidate:
         waiting.set()
@@ -252,10 +251,10 @@ def test_the_own_thread_blocks_no_frame_and_ends(
     def threads() -> list[threading.Thread]:
         return [one for one in threading.enumerate() if one.name.startswith("mereo-search")]
 
-    monkeypatch.setattr(tracking, "search_hypotheses", slow)
     with Tracker(registrar) as tracker:
         tracker.follow(frames["here"], 0.0, scene_unit=1.0)
         assert not threads()
+        monkeypatch.setattr(answer_frame, "search_hypotheses", slow)
         assert tracker.follow(frames["there"], 0.03, scene_unit=1.0).tracking == "lost" and waiting.wait(60)
         assert tracker.follow(frames["there"], 0.06, scene_unit=1.0).tracking == "lost" and len(threads()) == 1
         goes_on.set()

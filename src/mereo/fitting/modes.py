@@ -30,13 +30,9 @@ def refined(problem: Problem, posed: Posed) -> "ScoredFit":
     return ScoredFit.of(problem, posed).better(problem, refine(problem, posed))
 
 
-def has_many_optima(problem: Problem) -> bool:
-    """Whether many distances are kept, so that the states lie on a curved set; smooth bending has one optimum."""
-    return len(problem.model.pairs) >= 300
-
-
-SHAKES, SHAKEN = 8, 12
-"""Rounds of shaking at most, and starts in each."""
+SHAKES, SHAKEN, CURVED = 8, 12, 300
+"""Rounds of shaking at most, and starts in each; and from how many kept distances on the states lie on a curved set,
+while smooth bending has one optimum."""
 
 HOPELESS = 4.0
 """Misfit of the cloud from which on a fit is of something else: after two rounds of a search own views have up to 2.6,
@@ -50,7 +46,7 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     where the unit is unknown: frames of other things are explained no less without it, and cost a third more with it.
     """
     rng = np.random.default_rng(0)
-    for _ in range(SHAKES * (has_many_optima(problem) and not problem.is_scale_open)):
+    for _ in range(SHAKES * (len(problem.model.pairs) >= CURVED and not problem.is_scale_open)):
         is_over = best.explains(problem) or best.misfit.cloud > HOPELESS
         if is_over or (problem.is_noisy and problem.share_on(best.surface) < problem.accepted):
             break

@@ -25,7 +25,7 @@ from mereo.fitting.problem.gauss_newton import DAMPING, POSE, NormalEquations, P
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Prior, are_near
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit, search_hypotheses
+from mereo.fitting.registration.answer_frame import answer_of, find, in_registered_unit
 from mereo.fitting.registration.recognition import Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.search import WHOLE
@@ -247,8 +247,15 @@ class SynchronousExecutor(Executor):
         return future
 
 
-Search = Callable[[Observation, Registrar, bool, float | None], Candidate]
-"""What finds the object in a frame, as ``search_hypotheses`` does."""
+Locate = Callable[[Observation, Registrar, bool, float | None], tuple[Observation, Candidate]]
+"""What finds the object in a frame, as ``locate`` does."""
+
+
+def locate(
+    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
+) -> tuple[Observation, Candidate]:
+    """What of a frame is taken for the object, and its best candidate; the arguments are those of ``find``."""
+    return seen, find(seen, registrar.network, registrar, keep_all, scene_unit)
 
 
 class BackgroundSearch:
@@ -258,13 +265,13 @@ class BackgroundSearch:
         registrar: of the object.
         executor: what does the searches, the caller's to end; None for a thread of its own, which starts when the
             first search does and ends with ``close``.
-        search: what finds the object in a frame; None is ``search_hypotheses``.
+        locate: what finds the object in a frame.
     """
 
-    def __init__(self, registrar: Registrar, executor: Executor | None = None, search: Search | None = None) -> None:
+    def __init__(self, registrar: Registrar, executor: Executor | None = None, locate: Locate = locate) -> None:
         self.registrar = registrar
         self.executor = executor
-        self.search = search
+        self.locate = locate
         self._thread = ThreadPoolExecutor(1, "mereo-search")
         self._running: tuple[TrackedFrame, Future[Candidate]] | None = None
 
@@ -272,9 +279,12 @@ class BackgroundSearch:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
             executor = self._thread if self.executor is None else self.executor
-            search, options = self.search or search_hypotheses, (frame.keep_all, frame.scene_unit)
-            searched = executor.submit(lambda: search(frame.seen, self.registrar.narrowed(frame.scene), *options))
-            self._running = frame, searched
+            self._running = frame, executor.submit(lambda: self.find(frame)[1])
+
+    def find(self, frame: TrackedFrame) -> tuple[Observation, Candidate]:
+        """What of a frame is taken for the object, and its best candidate, at once."""
+        registrar = self.registrar.narrowed(frame.scene)
+        return self.locate(frame.seen, registrar, frame.keep_all, frame.scene_unit)
 
     def take(self) -> tuple[TrackedFrame, Candidate] | None:
         """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
@@ -315,7 +325,7 @@ class Tracker:
         registrar: Registrar,
         config: TrackConfig = TrackConfig(),  # noqa: B008 (frozen)
         executor: Executor | None = None,
-        search: Search | None = None,
+        locate: Locate = locate,
     ) -> None:
         """Follow an object.
 
@@ -323,11 +333,11 @@ class Tracker:
             registrar: of the object.
             config: constants.
             executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
-            search: what finds it; None is ``search_hypotheses``.
+            locate: what finds it.
         """
         self.registrar = registrar
         self.config = config
-        self._search = BackgroundSearch(registrar, executor, search)
+        self._search = BackgroundSearch(registrar, executor, locate)
         self.forget()
 
     def __enter__(self) -> "Tracker":
@@ -427,14 +437,10 @@ class Tracker:
         self._T_camera_input, self._axes = before
         return None
 
-    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
-        """What of a frame is taken for the object, and its best candidate."""
-        return frame.seen, find(frame.seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
-
     def _by_itself(self, frame: TrackedFrame, started: float) -> Answer | None:
         """Answer a frame by itself, which begins a track; None where nothing explains it."""
         registrar, config = self.registrar.narrowed(frame.scene), self.config
-        seen, candidate = self._locate(frame, registrar)
+        seen, candidate = self._search.find(frame)
         self._has_begun = True
         if candidate.modes is None:
             return None

@@ -10,7 +10,6 @@ from typing import Any
 from mereo.fitting import tracking
 from mereo.fitting.config import TrackConfig
 from mereo.fitting.registration.answer import Answer, Candidate
-from mereo.fitting.registration.answer_frame import search_hypotheses
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import Track, TrackedFrame
 from mereo.locating.whole_frame import NEAR, at_point, is_whole, locate_object, part_of, pixels_near
@@ -18,11 +17,12 @@ from mereo.reconstruction.observation import Observation
 from mereo.scenes.scene import Scene
 
 
-def search_frame(seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None) -> Candidate:
-    """Search the object, as ``search_hypotheses``, where a whole frame has it."""
-    if is_whole(seen, registrar):
-        return locate_object(seen, registrar, keep_all, scene_unit)[1]
-    return search_hypotheses(seen, registrar, keep_all, scene_unit)
+def locate(
+    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
+) -> tuple[Observation, Candidate]:
+    """What of a frame is taken for the object, as ``tracking.locate``, where a whole frame has it."""
+    where = locate_object if is_whole(seen, registrar) else tracking.locate
+    return where(seen, registrar, keep_all, scene_unit)
 
 
 class Tracker(tracking.Tracker):
@@ -35,7 +35,7 @@ class Tracker(tracking.Tracker):
         executor: Executor | None = None,
     ) -> None:
         """Follow an object; the arguments are those of ``tracking.Tracker``."""
-        super().__init__(registrar, config, executor, search_frame)
+        super().__init__(registrar, config, executor, locate)
 
     def follow(
         self,
@@ -49,11 +49,6 @@ class Tracker(tracking.Tracker):
         """Answer the next frame, as ``tracking.Tracker``; a point is where the object is in the first one."""
         seen = replace(seen, point=None) if self._has_begun else at_point(seen, self.registrar)
         return super().follow(seen, time_s, scene_unit=scene_unit, keep_all=keep_all, scene=scene)
-
-    def _locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
-        if not is_whole(frame.seen, registrar):
-            return super()._locate(frame, registrar)
-        return locate_object(frame.seen, registrar, frame.keep_all, frame.scene_unit)
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:
         whole = frame.seen.frame.whole
