@@ -247,15 +247,13 @@ class SynchronousExecutor(Executor):
         return future
 
 
-Locate = Callable[[Observation, Registrar, bool, float | None], tuple[Observation, Candidate]]
+Locate = Callable[[TrackedFrame, Registrar], tuple[Observation, Candidate]]
 """What finds the object in a frame, as ``locate`` does."""
 
 
-def locate(
-    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
-) -> tuple[Observation, Candidate]:
-    """What of a frame is taken for the object, and its best candidate; the arguments are those of ``find``."""
-    return seen, find(seen, registrar.network, registrar, keep_all, scene_unit)
+def locate(frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
+    """What of a frame is taken for the object, and its best candidate; raises as ``find`` does."""
+    return frame.seen, find(frame.seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
 
 
 class BackgroundSearch:
@@ -279,12 +277,8 @@ class BackgroundSearch:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
             executor = self._thread if self.executor is None else self.executor
-            self._running = frame, executor.submit(lambda: self.find(frame)[1])
-
-    def find(self, frame: TrackedFrame) -> tuple[Observation, Candidate]:
-        """What of a frame is taken for the object, and its best candidate, at once."""
-        registrar = self.registrar.narrowed(frame.scene)
-        return self.locate(frame.seen, registrar, frame.keep_all, frame.scene_unit)
+            searched = executor.submit(lambda: self.locate(frame, self.registrar.narrowed(frame.scene))[1])
+            self._running = frame, searched
 
     def take(self) -> tuple[TrackedFrame, Candidate] | None:
         """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
@@ -440,7 +434,7 @@ class Tracker:
     def _by_itself(self, frame: TrackedFrame, started: float) -> Answer | None:
         """Answer a frame by itself, which begins a track; None where nothing explains it."""
         registrar, config = self.registrar.narrowed(frame.scene), self.config
-        seen, candidate = self._search.find(frame)
+        seen, candidate = self._search.locate(frame, registrar)
         self._has_begun = True
         if candidate.modes is None:
             return None

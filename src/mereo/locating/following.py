@@ -17,12 +17,11 @@ from mereo.reconstruction.observation import Observation
 from mereo.scenes.scene import Scene
 
 
-def locate(
-    seen: Observation, registrar: Registrar, keep_all: bool, scene_unit: float | None
-) -> tuple[Observation, Candidate]:
+def locate(frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
     """What of a frame is taken for the object, as ``tracking.locate``, where a whole frame has it."""
-    where = locate_object if is_whole(seen, registrar) else tracking.locate
-    return where(seen, registrar, keep_all, scene_unit)
+    if is_whole(frame.seen, registrar):
+        return locate_object(frame.seen, registrar, frame.keep_all, frame.scene_unit)
+    return tracking.locate(frame, registrar)
 
 
 class Tracker(tracking.Tracker):

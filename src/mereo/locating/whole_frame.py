@@ -25,7 +25,7 @@ from mereo.fitting.registration.answer_frame import (
     fit_states,
     scene_unit_of,
 )
-from mereo.fitting.registration.recognition import FIT, REFUSED, Known, Signs
+from mereo.fitting.registration.recognition import FIT, REFUSED, Signs, known_by
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.search import ROUNDS, SearchRound, screen_poses
 from mereo.geometry.camera import DepthImage
@@ -49,8 +49,8 @@ LOOKS, ANSWERS = 12, 3
 """Regions that are looked at, and of these how many are answered, at most."""
 
 CHANCE = -6.5
-"""Nats of an object at a place of a frame where nobody says that it is there, beside those of the outline and of the
-fit: by a logistic regression of training desks, which gives these a weight of one (docs/experiments/098.md)."""
+"""Nats of an object at a place of a frame where nobody says that it is there, to which those of outline and fit are
+added: by a logistic regression of training desks, which gives these a weight of one (docs/experiments/098.md)."""
 
 WORTH = 2.5
 """Nats that a better state must win at a place to be searched for."""
@@ -460,15 +460,14 @@ def judged(answer: Answer, outline: Outline | None, stated: float = 0.0) -> Answ
     """The same, unsure or not known where its evidence speaks against it; ``stated`` are the nats of who says where."""
     if outline is None or answer.registration is None or answer.recognition.known is False:
         return answer
-    nats = evidence_of(answer, outline, stated)
-    if nats > 0:
+    known = known_by(evidence_of(answer, outline, stated))
+    if known is True:
         return answer
     reason = (
         f"its outline is not clearly that of what was seen ({outline.hits} of {outline.hits + outline.misses} pixels "
         f"of it have an edge, {outline.past} inside have seen past it): look at the result before you rely on it, or "
         "take a frame that shows more of its outline"
     )
-    known: Known = False if nats < REFUSED else "unsure"
     return replace(answer, recognition=replace(answer.recognition, known=known, reason=reason))
 
 

@@ -29,6 +29,11 @@ REFUSED = -3.0
 """Nats below which the object is not known; up to 0 it may be there."""
 
 
+def known_by(nats: float) -> Known:
+    """Whether the object is known by these nats."""
+    return True if nats > 0 else "unsure" if nats >= REFUSED else False
+
+
 @dataclass(frozen=True)
 class Signs:
     """Signs that a frame does not show the object in a state that was learned; None where one is not known.
@@ -134,7 +139,9 @@ def recognize(
     unseen: float | None = None,
     has_weights: bool = True,
 ) -> Recognition:
-    """Whether a frame shows the object, in a state that was learned; never true of a fit that is not accepted.
+    """Whether a frame shows the object, in a state that was learned.
+
+    Never true of a fit that is not accepted, and where another state explains the frame alike.
 
     Args:
         registration: of the object's model to the frame; None where the network alone answers.
@@ -145,12 +152,13 @@ def recognize(
     if registration is None:
         return NOT_EVALUATED
     signs = Signs.of(registration, stated_scene_unit, unseen)
-    nats, against = signs.nats, signs.against
-    if nats > 0 and registration.accepted:
-        return Recognition(True, None, signs, has_weights)
-    sign = "unexplained" if nats > 0 else max(against, key=lambda name: against[name])
-    known: Known = False if nats < REFUSED else "unsure"
-    return Recognition(known, _reason(sign, registration, signs, WORDS[has_weights]), signs, has_weights)
+    known, against = known_by(signs.nats), signs.against
+    recognition = Recognition(known, None, signs, has_weights)
+    if known is not True or not registration.accepted:
+        sign = "unexplained" if known is True else max(against, key=lambda name: against[name])
+        reason = _reason(sign, registration, signs, WORDS[has_weights])
+        recognition = replace(recognition, known=known and "unsure", reason=reason)  # refused, or unsure
+    return recognition.doubted(registration.doubt)
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------
