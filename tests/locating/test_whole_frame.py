@@ -253,7 +253,8 @@ def looked_at(
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(WholeFrame, "look", look)
         seen = find_object(mereo.load_frame(image, unit_m=1.0), config)
-        assert is_whole(seen, registrar) and len(WholeFrame.of(seen, registrar).places()) == len(looked)
+        assert is_whole(seen, registrar)
+        assert len(list(WholeFrame.of(seen, registrar).places())) == min(1, len(looked))
     return looked
 
 

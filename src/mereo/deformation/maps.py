@@ -169,7 +169,7 @@ def turn(
 
 def crossing(vectors: PointArray) -> Float[ndarray, "*n 3 3"]:
     """Matrices whose rows are v x e_k, so that ``points @ matrix`` is v x p; many times faster than numpy's cross."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
+    x, y, z = (vectors[..., axis] for axis in range(3))
     result = np.zeros((*vectors.shape, 3))
     result[..., 0, 1], result[..., 0, 2] = z, -y
     result[..., 1, 0], result[..., 1, 2] = -z, x

@@ -58,14 +58,14 @@ class DrawsConfig:
 
     Attributes:
         starts: random states, most like a shape, from which fits start.
-        sieve: how many of the best of these approach the shape, one stage after the other.
+        approaching: how many of these approach the shape at most.
         cloud_weight: how many independent points the cloud is worth, also where draws and modes are compared.
         last_rounds: sets of differences in the fit to the frame.
         steps: at most with one set of differences.
     """
 
     starts: int = 40
-    sieve: tuple[int, ...] = (10, 2)
+    approaching: int = 10
     cloud_weight: float = 1500.0
     last_rounds: int = 2
     steps: int = 6

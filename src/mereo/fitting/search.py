@@ -726,6 +726,12 @@ class Trail:
             problem.shares_noise and (settled := settled_once(problem, best.posed)).explains(settled.problem)
         )
 
+    @property
+    def is_evident(self) -> bool:
+        """Whether that explains a clean frame, and no other hypothesis may win as much as the frame rules out of it."""
+        ruled_out = self.problem.silhouette_misfit(self.best.surface)
+        return self.is_explained and not self.problem.is_noisy and ruled_out + self.handicap < WHOLE
+
     def go_on(self, stage: SearchRound, poses: list[Posed]) -> None:
         """Fit the candidates of a round that may be the best."""
         ranked = bend_by_few(self.problem, poses, stage.fitted)
@@ -809,7 +815,7 @@ def search(
     What explains a clean frame is searched for no further; under noise several states do, of which a start is one.
 
     ``partial`` is the same where it is open whether the object is seen whole: with nothing known around the cloud. It
-    is taken where it explains the frame better by more than ``WHOLE``.
+    is taken where it explains the frame better by more than ``WHOLE``, and not searched where it cannot.
     """
     trails = [Trail(whole)] if partial is None else [Trail(whole), Trail(partial, WHOLE)]
     if starts:
@@ -822,18 +828,18 @@ def search(
     if isinstance(whole.model, Mechanism):  # its poses take seconds, so that which rules out least says those of both
         rounds, screened = MECHANISM_ROUNDS[: len(rounds)], trails[-1:]
     for stage in rounds:
-        poses = [screen_poses(trail.problem, stage) for trail in screened]
-        for trail, each in zip(trails, cycle(poses)):
+        poses = (screen_poses(trail.problem, stage) for trail in screened)
+        for trail, each in zip(trails, cycle(poses)):  # screened once it is its turn
             trail.go_on(stage, each)
+            if trail.is_evident:
+                return trail
         for trail, other in permutations(trails, 2):  # either may have found what the other has missed
             trail.fitted.append(refined(trail.problem, other.best.posed))
         trails = with_left_noise(trails)
         chosen = likelier(trails)
         chosen.shake()
-        if chosen.is_explained:
-            return chosen
         heavier = chosen.with_heavier_cloud()
-        if chosen.is_repeated or (heavier is not None and heavier.is_explained):
+        if chosen.is_explained or chosen.is_repeated or (heavier is not None and heavier.is_explained):
             break
     return heavier or chosen.with_shared_noise()
 

@@ -55,6 +55,9 @@ added: by a logistic regression of training desks, which gives these a weight of
 WORTH = 2.5
 """Nats that a better state must win at a place to be searched for."""
 
+EVIDENT = WORTH - FIT - CHANCE
+"""Nats of an outline from which on a place is evident, if its fit leaves no more to be won."""
+
 NOWHERE = (
     "nothing {} is of the object's size and shape: check both units (--depth-scale, --units), or say "
     "where it is (--point, --mask, --box)"
@@ -187,15 +190,22 @@ class WholeFrame:
         ranked = sorted((self.place(mask, [posed]) for _, posed in states), key=lambda place: -place.outline.nats)
         return replace(ranked[0], states=tuple(place.states[0] for place in ranked))
 
-    def places(self) -> list[Place]:
-        """Places where the object may be, the most evident first."""
+    def places(self) -> Iterator[Place]:
+        """Places where the object may be, at least one: such as may be evident at once, then others, ranked."""
         model = self.registrar.model
         area = self.unit**2 * ConvexHull(model.rest_points).area / 4  # of its shadow, over all directions
         image, first = self.jumps.image, self.every // 2
         kept = self.seen.kept_pixels()[first :: self.every, first :: self.every]
         part = DepthImage(np.where(kept, image.depth, 0.0), image.camera)
         masks = islice(filter(self.is_at_point, regions(part, 2 * model.half * self.unit, area)), LOOKS)
-        return sorted(map(self.look, masks), key=lambda place: -place.outline.nats)
+        others = list[Place]()
+        for place in map(self.look, masks):
+            if place.outline.nats > EVIDENT:
+                yield place
+            else:
+                others.append(place)
+        others.sort(key=lambda place: -place.outline.nats)
+        yield from (place for row, place in enumerate(others) if row == 0 or place.outline.nats > 0)
 
     def chosen(self, place: Place) -> Observation:
         """The object with the pixels of the whole image that a place explains, and those of its region near it."""
@@ -367,9 +377,8 @@ def answers_in(
     are left out, and so are those where a fit finds nothing. Parameters of the object's scene are fitted where it is
     evident (``WholeFrame.finished``).
     """
-    places = frame.places()
-    hopeful = [place for place in places[: ANSWERS + most - 1] if place.outline.nats > 0]
-    waiting: Iterable[Place] = map(frame.sharpened, hopeful or places[:1])  # each once it is its turn
+    places = islice(frame.places(), ANSWERS + most - 1)
+    waiting: Iterable[Place] = map(frame.sharpened, places)  # each once it is its turn
     taken = np.zeros_like(frame.jumps.image.valid)
     for rounds in ((), ROUNDS[:1]):
         answers = list[PlacedAnswer]()
@@ -378,14 +387,15 @@ def answers_in(
                 continue
             placed = frame.finished(placed, keep_all) if placed.is_evident else placed
             yield placed
-            if placed.is_evident:
-                taken |= frame.explained(placed.mesh)
-                most -= 1
+            taken |= placed.is_evident & frame.explained(placed.mesh)
+            most -= placed.is_evident
             if most == 0:
                 return
             answers.append(placed)
         least = min(0.0, max((placed.score for placed in answers), default=0.0))
-        waiting = [each.place for each in answers if hopeful and each.lost >= WORTH and each.nats > least]
+        waiting = [
+            each.place for each in answers if each.place.outline.nats > 0 and each.lost >= WORTH and each.nats > least
+        ]
 
 
 def answer_observation(

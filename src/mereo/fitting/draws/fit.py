@@ -30,6 +30,7 @@ from mereo.fitting.problem.residuals import (
     robust_square,
     silhouette_losses,
 )
+from mereo.fitting.problem.segments import rms_distance
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.transforms import best_rotations
 from mereo.scenes.statistical_model import StatisticalModel
@@ -336,21 +337,30 @@ def fit_draws(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
 def start_near(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """State of the scene that is like a fit of the modes, and explains the frame best; None without any.
 
-    The states most like it approach its shape, ever fewer of them.
+    The states most like it approach its shape, until two of them are alike; that which explains the frame best, again.
     """
     states, shape = problem.states, Shape.of_material(problem, problem.model.material(modes.z))
     guess = states.guess(modes.z, problem.model.motion)
     laid = (lay_on_shape(states, shape, start, start.z) for start in (*similar_states(problem, shape), guess))
-    starts = [state for state in laid if state is not None]
-    for keep in problem.config.sieve:
-        starts = [approach(states, shape, start) for start in sorted(starts, key=by_misfit)[:keep]]
-    fits = list[DrawsFit]()
-    for start in starts:
-        translation = modes.place(start.translation[None])[0]
-        posed = Posed(modes.rotation @ start.rotation, translation, np.empty(0), modes.log_scale)
-        fit = simulate(problem, start.drawn, start.z, posed)
-        fits += [] if fit is None else [replace(fit, motion=start.motion)]
-    return min(fits, key=by_misfit, default=None)
+    starts = sorted((state for state in laid if state is not None), key=by_misfit)
+    ends = list[StateOnShape]()
+    for start in starts[: problem.config.approaching]:
+        ends.append(approach(states, shape, start))
+        places = np.stack([end.points @ end.rotation.T + end.translation for end in ends])
+        nearest = places[np.argmin([end.misfit for end in ends])]
+        if np.count_nonzero(rms_distance(places - nearest) < shape.std) > 1:
+            break
+    fits = [(fit, end) for end in ends if (fit := in_frame(problem, modes, end))]
+    best = min(fits, key=lambda pair: by_misfit(pair[0]), default=None)
+    return best and in_frame(problem, modes, approach(states, shape, best[1]))
+
+
+def in_frame(problem: DrawsProblem, modes: Posed, state: StateOnShape) -> DrawsFit | None:
+    """Compare a state on the shape of the modes with the frame; None where no face of it is seen."""
+    translation = modes.place(state.translation[None])[0]
+    posed = Posed(modes.rotation @ state.rotation, translation, np.empty(0), modes.log_scale)
+    fit = simulate(problem, state.drawn, state.z, posed)
+    return fit and replace(fit, motion=state.motion)
 
 
 def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
