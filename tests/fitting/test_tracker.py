@@ -268,8 +268,9 @@ def test_the_own_thread_blocks_no_frame_and_ends(
     assert not threads()
 
 
-def test_faults_of_a_search_are_raised_and_unusable_frames_are_none(registrar: Registrar, held: HeldExecutor) -> None:
-    search, frame = BackgroundSearch(registrar, held), TrackedFrame(observe(PointCloud(np.eye(3))), 0.0)
+def test_faults_of_a_search_are_raised_and_unusable_frames_are_none(held: HeldExecutor) -> None:
+    frame = TrackedFrame(observe(PointCloud(np.eye(3))), 0.0)
+    search = BackgroundSearch(held.submit, held)
     for _ in range(2):  # one at a time
         search.start(frame)
     assert search.take() is None

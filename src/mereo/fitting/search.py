@@ -27,6 +27,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from mereo.deformation.maps import crossing
 from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import (
     BENT_APART,
@@ -104,7 +105,8 @@ class ShapeTables:
         half: float,
     ) -> "ShapeTables":
         """Tables of samples, of an object of this half length."""
-        position, margin = np.ascontiguousarray(position), np.float32(0.5 * half)  # beyond, all points are outliers
+        position = np.ascontiguousarray(position)
+        margin = np.float32(0.5 * half)  # beyond, all points are outliers
         low, high = position.min(axis=1) - margin, position.max(axis=1) + margin
         cell = (high - low).max(axis=1) / CELLS
         low = (low + high - CELLS * cell[:, None]) / 2
@@ -388,7 +390,8 @@ class SightTable:
         self, poses: Poses, position: Float32[np.ndarray, "n p 3"], normal: Float32[np.ndarray, "n p 3"]
     ) -> Bool[np.ndarray, "n p"]:
         """Whether samples can be what was observed: those that face the camera."""
-        size, inverse = np.exp(poses.log_scale)[:, None, None], poses.rotation.transpose(0, 2, 1)
+        size = np.exp(poses.log_scale)[:, None, None]
+        inverse = poses.rotation.transpose(0, 2, 1)
         camera = -np.matmul(inverse, poses.translation[..., None]).transpose(0, 2, 1) / size
         return np.einsum("npi,npi->np", camera - position, normal) > 0
 
@@ -499,7 +502,8 @@ class Screen:
         weight = weight / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
         middle = np.matmul(weight.transpose(0, 2, 1), self.tables.position)  # q r 3
         state, turn = np.divmod(np.arange(len(middle) * len(rotations)), len(rotations))
-        rotation, middle = rotations[turn], middle[state, turn]
+        rotation = rotations[turn]
+        middle = middle[state, turn]
         log_scale = np.zeros(len(state), dtype=np.float32)
         if self.scaled:
             position = np.matmul(self.tables.position[state] - middle[:, None], rotation.transpose(0, 2, 1))
@@ -538,15 +542,18 @@ class Screen:
         size = np.exp(poses.log_scale)[:, None, None]
         seen = np.matmul(self.points - poses.translation[:, None], poses.rotation) / size
         position, normal, owner, few, few_owner, twists = self.tables.met(poses, seen)
-        offset, narrow = seen - position, sigma / size[..., 0]
+        offset = seen - position
+        narrow = sigma / size[..., 0]
         facing = self.sight.facing(poses, position, normal)
         squared = np.einsum("npi,npi->np", offset, offset) / narrow**2
         squared = np.where(facing, squared, squared + ROBUST**2)
         direction, amount = self.sight.violations(poses.place(few), ROBUST * sigma)
-        outside, robust = (amount / sigma) ** 2, (4 * ROBUST) ** 2
+        outside = (amount / sigma) ** 2
+        robust = (4 * ROBUST) ** 2
         cost = (squared / (1.0 + squared / ROBUST**2)).mean(axis=1)
         cost = cost + OUTSIDE * (outside / (1.0 + outside / robust)).mean(axis=1)
-        bent, bends = poses.z[:, : twists.shape[3]], np.arange(7, 7 + twists.shape[3])
+        bent = poses.z[:, : twists.shape[3]]
+        bends = np.arange(7, 7 + twists.shape[3])
         cost = cost + (bent**2).sum(axis=1) / FitConfig.cloud_weight
         poses = replace(poses, cost=cost.astype(np.float32))
         if not moves:
@@ -554,7 +561,8 @@ class Screen:
         weight = np.where(facing, 1.0 / (1.0 + squared / ROBUST**2) ** 2, 0.0) / len(self.points)
         weight_outside = OUTSIDE / few.shape[1] / (1.0 + outside / robust) ** 2
         toward = np.matmul(direction, poses.rotation)  # in the model's frame, where a sample moves the other way
-        across, beyond = np.einsum("npi,npi->np", offset, normal), amount / size[..., 0]
+        across = np.einsum("npi,npi->np", offset, normal)
+        beyond = amount / size[..., 0]
         weight_outside = np.where(amount > 0, weight_outside, 0.0)
         columns = np.concatenate([_across(seen, normal, across), -_across(few, toward, beyond)], axis=2)
         weights, owners = (np.concatenate(pair, axis=1) for pair in ((weight, weight_outside), (owner, few_owner)))
@@ -581,9 +589,10 @@ def _across(
 def _along(seen: Float[np.ndarray, "n p 3"], offset: Float[np.ndarray, "n p 3"]) -> Float32[np.ndarray, "n 8 r"]:
     """Columns of points' distances in space from the nearest samples, along one axis after the other."""
     columns = np.zeros((len(seen), 8, 3, seen.shape[1]), dtype=np.float32)
-    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-        columns[:, j, i], columns[:, k, i], columns[:, 3 + i, i] = seen[..., k], -seen[..., j], 1.0
-        columns[:, 6, i], columns[:, 7, i] = -seen[..., i], offset[..., i]
+    columns[:, :3] = crossing(seen).transpose(0, 3, 2, 1)
+    columns[:, range(3, 6), range(3)] = 1.0
+    columns[:, 6] = -seen.transpose(0, 2, 1)
+    columns[:, 7] = offset.transpose(0, 2, 1)
     return columns.reshape(len(seen), 8, -1)
 
 
@@ -608,15 +617,14 @@ def _moved(poses: Poses, matrix: Float[np.ndarray, "n q q"], gradient: Float[np.
     """Poses after the step of the normal equations."""
     matrix, gradient = matrix.astype(np.float64), gradient.astype(np.float64)
     free = np.delete(np.arange(gradient.shape[1]), [] if scaled else 6)  # without the scale
-    matrix, step = matrix[:, free][:, :, free], np.zeros_like(gradient)
+    matrix = matrix[:, free][:, :, free]
+    step = np.zeros_like(gradient)
     diagonal = np.einsum("nkk->nk", matrix)
     matrix = matrix + (DAMPING * diagonal + 1e-9)[:, :, None] * np.eye(len(free))
     step[:, free] = -np.linalg.solve(matrix, gradient[:, free, None])[..., 0]
     angle = np.linalg.norm(step[:, :3], axis=1, keepdims=True)
     step[:, :3] *= np.minimum(1.0, FARTHEST / np.maximum(angle, 1e-9))
-    log_scale = poses.log_scale.astype(np.float64)
-    if scaled:
-        log_scale = log_scale + np.clip(step[:, 6], -FARTHEST, FARTHEST)
+    log_scale = poses.log_scale.astype(np.float64) + np.clip(step[:, 6], -FARTHEST, FARTHEST)
     rotation = poses.rotation @ Rotation.from_rotvec(-step[:, :3]).as_matrix()
     bent = poses.z.copy()
     bent[:, : step.shape[1] - 7] += np.clip(step[:, 7:], -FARTHEST, FARTHEST)
@@ -867,9 +875,6 @@ def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
     for _ in range(stage.near * min(problem.model.count, 1)):
         near = Poses.of_all([tables.near(poses.rows(np.array([row])), stage.bent, rng) for row in range(len(poses))])
         poses = screen.differing(Poses.of_all([poses, screen.best(near, stage.bent)]), stage.bent)
-    states = list[Posed]()
-    for row in range(len(poses)):
-        rotation, z = Rotation.from_matrix(poses.rotation[row]).as_matrix(), poses.z[row]
-        translation, log_scale = poses.translation[row].astype(np.float64), float(poses.log_scale[row])
-        states.append(Posed(rotation, translation, z.astype(np.float64), log_scale))
-    return states
+    rotation = Rotation.from_matrix(poses.rotation).as_matrix()
+    translation = poses.translation.astype(np.float64)
+    return list(map(Posed, rotation, translation, poses.z.astype(np.float64), poses.log_scale.tolist()))

@@ -247,29 +247,18 @@ class SynchronousExecutor(Executor):
         return future
 
 
-Locate = Callable[[TrackedFrame, Registrar], tuple[Observation, Candidate]]
-"""What finds the object in a frame, as ``locate`` does."""
-
-
-def locate(frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
-    """What of a frame is taken for the object, and its best candidate; raises as ``find`` does."""
-    return frame.seen, find(frame.seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
-
-
 class BackgroundSearch:
     """Searches of one object, one at a time; used by one thread.
 
     Attributes:
-        registrar: of the object.
+        find: what finds the object in a frame.
         executor: what does the searches, the caller's to end; None for a thread of its own, which starts when the
             first search does and ends with ``close``.
-        locate: what finds the object in a frame.
     """
 
-    def __init__(self, registrar: Registrar, executor: Executor | None = None, locate: Locate = locate) -> None:
-        self.registrar = registrar
+    def __init__(self, find: Callable[[TrackedFrame], Candidate], executor: Executor | None = None) -> None:
+        self.find = find
         self.executor = executor
-        self.locate = locate
         self._thread = ThreadPoolExecutor(1, "mereo-search")
         self._running: tuple[TrackedFrame, Future[Candidate]] | None = None
 
@@ -277,8 +266,7 @@ class BackgroundSearch:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
             executor = self._thread if self.executor is None else self.executor
-            searched = executor.submit(lambda: self.locate(frame, self.registrar.narrowed(frame.scene))[1])
-            self._running = frame, searched
+            self._running = frame, executor.submit(self.find, frame)
 
     def take(self) -> tuple[TrackedFrame, Candidate] | None:
         """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
@@ -319,7 +307,6 @@ class Tracker:
         registrar: Registrar,
         config: TrackConfig = TrackConfig(),  # noqa: B008 (frozen)
         executor: Executor | None = None,
-        locate: Locate = locate,
     ) -> None:
         """Follow an object.
 
@@ -327,11 +314,10 @@ class Tracker:
             registrar: of the object.
             config: constants.
             executor: what searches for a lost object (``BackgroundSearch``); None for a thread of its own.
-            locate: what finds it.
         """
         self.registrar = registrar
         self.config = config
-        self._search = BackgroundSearch(registrar, executor, locate)
+        self._search = BackgroundSearch(lambda frame: self.locate(frame, registrar.narrowed(frame.scene))[1], executor)
         self.forget()
 
     def __enter__(self) -> "Tracker":
@@ -339,6 +325,10 @@ class Tracker:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
+        """What of a frame is taken for the object, and its best candidate; raises as ``find`` does."""
+        return frame.seen, find(frame.seen, registrar.network, registrar, frame.keep_all, frame.scene_unit)
 
     def forget(self) -> None:
         """Forget the track: the next frame is fitted by itself; a search that goes on is given up."""
@@ -434,7 +424,7 @@ class Tracker:
     def _by_itself(self, frame: TrackedFrame, started: float) -> Answer | None:
         """Answer a frame by itself, which begins a track; None where nothing explains it."""
         registrar, config = self.registrar.narrowed(frame.scene), self.config
-        seen, candidate = self._search.locate(frame, registrar)
+        seen, candidate = self.locate(frame, registrar)
         self._has_begun = True
         if candidate.modes is None:
             return None

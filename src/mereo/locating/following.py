@@ -3,51 +3,30 @@
 frame, time -locate_object, the first time and where it is lost-> part of the frame -Tracker.follow-> Answer
 """
 
-from concurrent.futures import Executor
 from dataclasses import replace
 from typing import Any
 
 from mereo.fitting import tracking
-from mereo.fitting.config import TrackConfig
 from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import Track, TrackedFrame
 from mereo.locating.whole_frame import NEAR, at_point, is_whole, locate_object, part_of, pixels_near
 from mereo.reconstruction.observation import Observation
-from mereo.scenes.scene import Scene
-
-
-def locate(frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
-    """What of a frame is taken for the object, as ``tracking.locate``, where a whole frame has it."""
-    if is_whole(frame.seen, registrar):
-        return locate_object(frame.seen, registrar, frame.keep_all, frame.scene_unit)
-    return tracking.locate(frame, registrar)
 
 
 class Tracker(tracking.Tracker):
     """Tracker that takes whole frames as well: of these it follows the pixels near where the object is expected."""
 
-    def __init__(
-        self,
-        registrar: Registrar,
-        config: TrackConfig = TrackConfig(),  # noqa: B008 (frozen)
-        executor: Executor | None = None,
-    ) -> None:
-        """Follow an object; the arguments are those of ``tracking.Tracker``."""
-        super().__init__(registrar, config, executor, locate)
+    def locate(self, frame: TrackedFrame, registrar: Registrar) -> tuple[Observation, Candidate]:
+        """What of a frame is taken for the object, where a whole frame has it; raises as ``find`` does."""
+        if is_whole(frame.seen, registrar):
+            return locate_object(frame.seen, registrar, frame.keep_all, frame.scene_unit)
+        return super().locate(frame, registrar)
 
-    def follow(
-        self,
-        seen: Observation,
-        time_s: float,
-        *,
-        scene_unit: float | None = None,
-        keep_all: bool = False,
-        scene: Scene | None = None,
-    ) -> Answer:
+    def follow(self, seen: Observation, *arguments: Any, **named: Any) -> Answer:
         """Answer the next frame, as ``tracking.Tracker``; a point is where the object is in the first one."""
         seen = replace(seen, point=None) if self._has_begun else at_point(seen, self.registrar)
-        return super().follow(seen, time_s, scene_unit=scene_unit, keep_all=keep_all, scene=scene)
+        return super().follow(seen, *arguments, **named)
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:
         whole = frame.seen.frame.whole

@@ -274,7 +274,7 @@ def locate_object(
     Raises ``NoFit`` where nothing in the frame may be it.
     """
     frame = WholeFrame.of(seen, replace(registrar, method="modes"), scene_unit)
-    best, *_ = instances_in(frame, list(answers_in(frame, registrar.network, keep_all)), keep_all)
+    best, *_ = instances_in(frame, answers_in(frame, registrar.network, keep_all), keep_all)
     return best.seen, best.candidate if best.nats > 0 else replace(best.candidate, modes=None)
 
 
@@ -430,7 +430,7 @@ def answer_observation(
     started = time.perf_counter()
     with stage("look through the whole frame"), limit_blas_threads():
         frame = WholeFrame.of(seen, registrar)
-        best, *others = instances_in(frame, list(answers_in(frame, model, keep_all, most)), keep_all, most)
+        best, *others = instances_in(frame, answers_in(frame, model, keep_all, most), keep_all, most)
     answer = absent(best) if best.nats < REFUSED else judged(best.answer, best.outline)
     stated: dict[str, Any] = {"resolution": resolution, "label_points": label_points}
     further = tuple(replace(each.answer, **stated) for each in others if best.nats >= REFUSED)
@@ -438,7 +438,7 @@ def answer_observation(
 
 
 def instances_in(
-    frame: WholeFrame, answers: Sequence[PlacedAnswer], keep_all: bool, most: int = 1
+    frame: WholeFrame, answers: Iterable[PlacedAnswer], keep_all: bool, most: int = 1
 ) -> list[PlacedAnswer]:
     """The most evident answer, and those that are believed where no better one explains the same pixels.
 

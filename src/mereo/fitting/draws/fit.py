@@ -374,8 +374,6 @@ def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     if start is None:
         return fit
     fit = descend(dense, start, problem.config.last_rounds)
-    if dense.base is sighted.base:
-        return fit
     end = simulate(sighted, fit.drawn, fit.z, fit.posed)
     assert end is not None  # it was played before
     return replace(end, motion=fit.motion, misfit=fit.misfit)
