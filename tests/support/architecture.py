@@ -134,7 +134,7 @@ BUDGET = {
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
-CHOICES = {"src/mereo/fitting": (234, 143), "src/mereo/locating": (33, 31)}
+CHOICES = {"src/mereo/fitting": (232, 143), "src/mereo/locating": (31, 30)}
 """Decisions (``if`` statements and expressions) and numbers in module constants that a folder may have at most.
 
 They choose among fits, and they only fall."""
