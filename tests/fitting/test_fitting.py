@@ -1,6 +1,7 @@
 """The fit of the object's own model: theorems on frames whose truth is known."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant
+from mereo.fitting.draws.fit import DrawsFit, DrawsProblem, Shape, approach, fit_draws, lay_on_shape, secant, start_near
 from mereo.fitting.draws.fit import narrowing as narrowing_of_draws
 from mereo.fitting.draws.playback import Drawn, DrawnStates
 from mereo.fitting.modes import ScoredFit, fit_wide, narrowing, refined, shaken
@@ -72,7 +73,8 @@ def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, r
 def test_to_rest_undoes_to_camera(registration: Registration) -> None:
     points = default_rng(0).uniform([-17, -5, -4], [17, 5, 4], size=(200, 3))
     labels = registration.rest_solids.label(points)
-    points, labels = points[labels > 0], labels[labels > 0]
+    points = points[labels > 0]
+    labels = labels[labels > 0]
     moved = registration.to_camera(points)
     assert_allclose(registration.to_rest(moved, labels), points, atol=1e-3)
 
@@ -122,7 +124,8 @@ def test_a_bent_object_is_not(model: StatisticalModel, excess: float) -> None:
 
 
 def test_under_noise_draws_are_asked_too_and_an_object_at_rest_stays_at_rest(model: StatisticalModel) -> None:
-    points, material = seen(model.rest.transformed(IN_FRONT)), transform_points(IN_FRONT, model.rest_points)
+    points = seen(model.rest.transformed(IN_FRONT))
+    material = transform_points(IN_FRONT, model.rest_points)
     clean = fit_modes(points, model, 1.0, material)
     noisy = replace(clean, problem=clean.problem.with_noise(0.2))
     assert noisy.may_take_draws and not clean.may_take_draws
@@ -153,8 +156,10 @@ def drawn(problem: DrawsProblem, fitted: ModesFit) -> DrawsFit:
 
 def test_a_secant_agrees_with_the_step_and_only_there() -> None:
     rng = default_rng(0)
-    motion, step = rng.normal(size=(5, 3, 4)).astype(np.float32), rng.normal(size=4)
-    moved, across = rng.normal(size=(5, 3)), np.array([step[1], -step[0], 0.0, 0.0])
+    motion = rng.normal(size=(5, 3, 4)).astype(np.float32)
+    step = rng.normal(size=4)
+    moved = rng.normal(size=(5, 3))
+    across = np.array([step[1], -step[0], 0.0, 0.0])
     found = secant(motion, step, moved)
     assert_allclose(found @ step, moved, atol=1e-5)
     assert_allclose(found @ across, motion @ across, atol=1e-5)
@@ -173,6 +178,18 @@ def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, stat
     assert np.median(apart[1]) < 0.3 * np.median(apart[0])
 
 
+def test_states_approach_a_shape_until_two_are_alike(
+    problem: DrawsProblem, fitted: ModesFit, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    count = Mock(wraps=approach)
+    monkeypatch.setattr("mereo.fitting.draws.fit.approach", count)
+    assert start_near(problem, fitted.posed) is not None
+    assert 3 <= count.call_count < problem.config.approaching
+    monkeypatch.setattr("mereo.fitting.draws.fit.rms_distance", lambda offset: np.full(len(offset), np.inf))
+    start_near(problem, fitted.posed)
+    assert count.call_count > problem.config.approaching, "of none alike each approaches it"
+
+
 def test_the_simpler_description_is_preferred_by_its_evidence(
     problem: DrawsProblem, fitted: ModesFit, drawn: DrawsFit
 ) -> None:
@@ -187,7 +204,8 @@ def test_the_simpler_description_is_preferred_by_its_evidence(
 
 
 def test_a_frame_that_says_nothing_narrows_no_state_whatever_distances_are_kept(fitted: ModesFit) -> None:
-    problem, shown = fitted.problem, narrowing(fitted.problem, fitted.posed)
+    problem = fitted.problem
+    shown = narrowing(fitted.problem, fitted.posed)
     silent = problem.changed(config=replace(problem.config, cloud_weight=0.0, silhouette_weight=0.0))
     assert shown > 10.0 and len(problem.model.pairs) > 0
     assert narrowing(silent, fitted.posed) == pytest.approx(0.0, abs=1e-6)

@@ -74,7 +74,8 @@ def test_a_network_that_is_lost_does_no_harm(
 
 
 def test_the_size_of_another_object_says_nothing_of_the_unit(liver: Model, cloud: PointCloud) -> None:
-    registrar, seen = Registrar.of(liver), observe(cloud)
+    registrar = Registrar.of(liver)
+    seen = observe(cloud)
     found = answer_to(cloud, liver, registrar, 24)
     assert found.seen.frame.unit_m == registrar.unit_of(found.registration)
     other = replace(found.recognition, known=False)
@@ -84,7 +85,8 @@ def test_the_size_of_another_object_says_nothing_of_the_unit(liver: Model, cloud
 def test_what_a_network_says_is_evidence(liver: Model, cloud: PointCloud) -> None:
     """It speaks against a state that is elsewhere by as many points as it is worth, and of nothing else."""
     modes = answer_to(cloud, liver, Registrar.of(liver), 24, scene_unit=1.0).candidate.modes
-    problem, surface = modes.problem, modes.surface
+    problem = modes.problem
+    surface = modes.surface
     elsewhere = Surface.through(problem.model, surface.material[::-1])
     assert 0 < problem.network_misfit(surface) < 0.2 * problem.network_misfit(elsewhere)
     deaf = problem.changed(network=None)
@@ -180,8 +182,10 @@ def test_the_noise_left_is_what_points_have_alone_and_as_much_as_neighbours_shar
     registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a wrong state leaves over beside that is none: its neighbours share it."""
-    modes, rng = fitted(registrar, points).modes, default_rng(1)
-    surface, own = modes.surface, rng.normal(scale=0.3, size=len(modes.problem.evidence.points))
+    modes = fitted(registrar, points).modes
+    rng = default_rng(1)
+    surface = modes.surface
+    own = rng.normal(scale=0.3, size=len(modes.problem.evidence.points))
     for share, off_by, expected in ((np.inf, 2.0, 0.3), (0.4, 2.0, 0.5), (0.4, 0.0, 0.3)):
         monkeypatch.setattr(Surface, "offsets", lambda *_, offset=own + off_by: offset)
         problem = replace(modes.problem, evidence=replace(modes.problem.evidence, shared_noise=SharedNoise(share)))
@@ -196,7 +200,8 @@ def test_the_first_noise_is_what_the_cloud_shows(points: np.ndarray) -> None:
 
 def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None:
     """An offset of all points, or of half of them, is the fit's; what each has for itself is the camera's."""
-    around, rng = Evidence.of(points).around, default_rng(0)
+    around = Evidence.of(points).around
+    rng = default_rng(0)
     own = rng.normal(scale=0.3, size=len(points))
     half = np.where(points[:, 0] > np.median(points[:, 0]), 2.0, 0.0)
     assert noise_of(own, around) == pytest.approx(0.3, rel=0.1)
@@ -222,7 +227,8 @@ def plate(pixels: int = 64) -> np.ndarray:
 
 def test_what_neighbours_share_leaves_a_fit_as_unsure_as_fewer_points() -> None:
     """Of windows of 4 x 4 pixels, off by as much as each pixel is besides, and twice that for what a fit has bent."""
-    rng, evidence = default_rng(0), Evidence.of(plate())
+    rng = default_rng(0)
+    evidence = Evidence.of(plate())
     pixel = cKDTree(plate()).query(evidence.points)[1]
     for window, expected in ((1, 2.0), (4, 2 * (16.0 + 1.0))):
         off = [np.kron(rng.normal(size=(64 // window,) * 2), np.ones((window, window))) for _ in range(8)]
@@ -238,8 +244,10 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
 ) -> None:
     modes = fitted(registrar, points).modes
     problem = modes.problem.with_noise(0.4)
-    rng, count = default_rng(0), len(problem.evidence.points)
-    own, common = rng.normal(scale=0.4, size=count), np.full(count, 0.4) * np.sign(problem.evidence.points[:, 0])
+    rng = default_rng(0)
+    count = len(problem.evidence.points)
+    own = rng.normal(scale=0.4, size=count)
+    common = np.full(count, 0.4) * np.sign(problem.evidence.points[:, 0])
     weights = list[float]()
     for offset in (own, own + common):
         monkeypatch.setattr(Surface, "offsets", lambda *_, offset=offset: offset)
@@ -266,7 +274,8 @@ def test_what_neighbours_share_is_told_from_what_points_have_alone(registrar: Re
 def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: np.ndarray) -> None:
     found = fitted(registrar, noisy(points, 0.4)).modes
     assert found is not None and found.problem.is_noisy
-    problem, aside = found.problem, found.surface.material + np.array([0.0, 0.0, 1.0])
+    problem = found.problem
+    aside = found.surface.material + np.array([0.0, 0.0, 1.0])
     assert problem.explained(9.0, found.surface, 0.1)
     assert not problem.explained(9.0, Surface.through(problem.model, aside), 0.1)
     assert not problem.with_noise(0.0).explained(9.0, found.surface, 0.1)

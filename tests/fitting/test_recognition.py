@@ -32,7 +32,8 @@ from mereo.scenes.statistical_model import StatisticalModel
 @pytest.fixture(scope="module")
 def registration(model: StatisticalModel) -> Registration:
     """A registration that nothing speaks against: the mean state."""
-    material, z = model.mean + np.array([0.0, 0.0, 100.0]), np.full(model.count, 0.5)
+    material = model.mean + np.array([0.0, 0.0, 100.0])
+    z = np.full(model.count, 0.5)
     found = Registration(model, material, "modes", z, 1.0, unit_known=False, explained=1.0, accepted=True, seconds=0.1)
     return replace(found, residual=0.05, ruled_out=0.0)
 
@@ -145,7 +146,8 @@ def test_a_smooth_patch_is_not_believed(model: StatisticalModel) -> None:
 
 
 def test_only_a_patch_is_explained_by_a_patch() -> None:
-    smooth, points = patch(0.05), patch(0.0).points
+    smooth = patch(0.05)
+    points = patch(0.0).points
     rough = points + [0.0, 0.0, 1.0] * np.where(np.abs(points[:, :1]) < 0.5, 0.4, 0.0)
     assert Evidence.of(smooth.points).patch_share(0.01) == 1.0
     assert Evidence.of(rough).patch_share(0.1) < 0.8

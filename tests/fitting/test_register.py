@@ -71,7 +71,8 @@ def found(model: Model, view: SampleView) -> Answer:
 
 
 def iou(view: SampleView, result: Reconstruction) -> float:
-    grid, kept = view.truth.grid, view.truth.kept
+    grid = view.truth.grid
+    kept = view.truth.kept
     points = grid.positions(np.argwhere(kept))
     labels = Solids(result.surfaces).label(points)
     return intersection_over_union(confusion_matrix(grid.labels[kept], labels, len(grid.names) + 1)).miou
@@ -87,7 +88,8 @@ def test_the_answer_is_the_model_itself(found: Answer, model: Model, view: Sampl
 
 
 def test_labels_are_those_of_the_segments(network: Reconstruction, found: Answer) -> None:
-    result, grid = found.reconstruction, found.reconstruction.labels
+    result = found.reconstruction
+    grid = found.reconstruction.labels
     index = np.argwhere(np.ones(grid.labels.shape, dtype=bool))
     agree = Solids(result.surfaces).label(grid.positions(index)) == grid.labels.reshape(-1)
     assert agree.mean() > 0.999 and not grid.touched_sides().any()
@@ -190,7 +192,8 @@ def test_what_is_no_place_or_motion_is_refused(case: str, found: Answer, monkeyp
 
 @pytest.mark.parametrize("scene_unit", [-1.0, 0.0, np.nan, np.inf])
 def test_a_scene_unit_is_a_length(scene_unit: float, view: SampleView, model: Model) -> None:
-    seen, registrar = observe(view.depth.to_points()), Registrar.of(model, "modes")
+    seen = observe(view.depth.to_points())
+    registrar = Registrar.of(model, "modes")
     sentence = "scene_unit is .*; it must be greater than 0"
     with pytest.raises(ValueError, match=sentence):
         answer_frame(seen, model, registrar, scene_unit=scene_unit)

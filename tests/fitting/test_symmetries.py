@@ -115,7 +115,8 @@ def test_a_peg_that_is_seen_leaves_no_turn_open() -> None:
     assert len(find_segment_turns(model)) == 1
     material = transform_points(IN_FRONT, model.rest_points)
     wheel = np.flatnonzero(model.labels[: sum(model.vertex_counts)] == 2)
-    vertices, rest = material[wheel], model.rest_points[wheel]
+    vertices = material[wheel]
+    rest = model.rest_points[wheel]
     on_peg = rest[:, 0] > 6.1
     assert on_peg.sum() > 3
     shown, hidden = (left_open(model, material, vertices[rows], 0.2, 1500.0) for rows in (on_peg, rest[:, 0] < 0.0))
@@ -131,7 +132,8 @@ def test_radii_hold_what_is_left_open() -> None:
     factor = 1e-3 * np.eye(7 + model.count)
     nothing = np.empty((len(material), 3, 0), dtype=np.float32)
     without = Posterior(posed, material, model.modes, factor, 0.0, nothing, nothing)
-    alone, parts = without.radii(), replace(without, open=turns).radii()
+    alone = without.radii()
+    parts = replace(without, open=turns).radii()
     radii = parts.radii()
     assert_allclose(parts.gaussian, alone.gaussian)
     assert not alone.open.any()

@@ -286,7 +286,8 @@ def test_faults_of_a_search_are_raised_and_unusable_frames_are_none(held: HeldEx
 def test_a_stream_says_that_an_object_is_lost(
     registrar: Registrar, frames: dict[str, Observation], searches: Searches, tmp_path: Path
 ) -> None:
-    answering, folder = Answering(None, registrar, 24, waits=True), SurfaceFolder(tmp_path / "out", False)
+    answering = Answering(None, registrar, 24, waits=True)
+    folder = SurfaceFolder(tmp_path / "out", False)
     lines = []
     for number, name in enumerate(("here", "thing")):
         answer = answering(StreamFrame(name, 0.03 * number, partial(frames.get, name)))
@@ -313,7 +314,8 @@ def crossing(registrar: Registrar) -> list[tuple[SegmentedMesh, SimulatedView]]:
         tool: tuple[Capsule, ...] = ()
         if BEFORE <= number < AFTER:
             share = np.sin(np.pi * (number - BEFORE + 0.5) / (AFTER - BEFORE))
-            width, z = high[0] - low[0], 0.9 * low[2]
+            width = high[0] - low[0]
+            z = 0.9 * low[2]
             x = 0.9 * (low[0] - width + (0.25 + 0.35 * share) * width)
             tool = (Capsule(np.array([x, -200.0, z]), np.array([x, 200.0, z]), 0.9 * width),)
         frames.append((mesh, view(mesh, number, tool)))
@@ -377,12 +379,15 @@ def apart(found: Answer, mesh: SegmentedMesh) -> float:
 def test_a_slow_sequence_is_tracked_as_its_frames_are_fitted(
     engine: Registrar, scene: Scene, unit: float | None
 ) -> None:
-    meshes, size = states(scene, SEED + 1, 8, 0.5), 1.0 if unit else 2.5
-    tracker, frames = Tracker(engine), [observe(PointCloud(size * seen(scene, mesh).points)) for mesh in meshes]
+    meshes = states(scene, SEED + 1, 8, 0.5)
+    size = 1.0 if unit else 2.5
+    tracker = Tracker(engine)
+    frames = [observe(PointCloud(size * seen(scene, mesh).points)) for mesh in meshes]
     found = [tracker.follow(frame, i / RATE_HZ, scene_unit=unit) for i, frame in enumerate(frames)]
     assert all(one.tracked for one in found[1:])
     assert norm(vertices(meshes[-1]) - vertices(meshes[0]), axis=1).max() > 0.5
-    alone, last = Tracker(engine).follow(frames[-1], 0.0, scene_unit=unit), meshes[-1]
+    alone = Tracker(engine).follow(frames[-1], 0.0, scene_unit=unit)
+    last = meshes[-1]
     truth = last.with_vertices([size * segment.vertices for segment in last.segments])
     assert apart(found[-1], truth) < apart(alone, truth) + 0.2 * size
     # the unit that was found is kept
@@ -420,7 +425,8 @@ def test_an_object_that_jumps_or_goes_and_comes_again_is_found_in_its_own_frame(
 def test_points_away_from_the_expected_surface_are_strays(
     engine: Registrar, scene: Scene, first: SegmentedMesh
 ) -> None:
-    cloud, tracker = seen(scene, first), Tracker(engine)
+    cloud = seen(scene, first)
+    tracker = Tracker(engine)
     tracker.follow(observe(cloud), 0.0, scene_unit=1.0)
     beside = observe(PointCloud(np.concatenate([cloud.points, 1.5 * cloud.points[:12]])))
     found = tracker.follow(beside, 0.03, scene_unit=1.0)
@@ -488,7 +494,8 @@ def test_frames_that_become_noisier_are_met_with_their_own_constants(
 
 @pytest.mark.slow
 def test_a_scanners_frames_are_answered_in_its_frame(engine: Registrar, scene: Scene, first: SegmentedMesh) -> None:
-    cloud, tracker = PointCloud(seen(scene, first).points @ SCANNER_TO_CAMERA.T), Tracker(engine)
+    cloud = PointCloud(seen(scene, first).points @ SCANNER_TO_CAMERA.T)
+    tracker = Tracker(engine)
     for number in range(2):
         found = tracker.follow(observe(cloud, "scanner"), number / RATE_HZ, scene_unit=1.0)
     assert found.tracked

@@ -79,7 +79,8 @@ def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
 def test_the_posterior_of_a_linear_problem_is_its_closed_form() -> None:
     """The pose is held; the prior is N(0, 1), measured is ``m_i z + noise``."""
     rng = default_rng(0)
-    modes, sigma = rng.normal(size=(7, 3, 1)).astype(np.float32), 0.3
+    modes = rng.normal(size=(7, 3, 1)).astype(np.float32)
+    sigma = 0.3
     held = NormalEquations.prior(np.zeros(1), np.zeros(1), np.eye(1), 0.0, 1e-6)
     matrix = held.matrix + np.diag([1e12] * 6 + [0.0, 0.0])
     jacobian = np.zeros((21, POSE + 1))
@@ -143,7 +144,8 @@ def test_a_calibration_scales_radii_and_intervals(found: Registration, sure: Unc
 
 
 def test_radii_reach_other_states_that_explain_the_frame_alike_and_no_farther(sure: Uncertainty) -> None:
-    optimum, way = sure.optimum, np.array([3.0, -4.0, 12.0])
+    optimum = sure.optimum
+    way = np.array([3.0, -4.0, 12.0])
     assert isinstance(optimum, ModesOptimum)
     moved = replace(sure, optimum=replace(optimum, others=(sure.posterior.material + way,)))
     assert_allclose(moved.material, sure.material + 13.0 * optimum.unit, rtol=1e-5)
@@ -155,7 +157,8 @@ def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
     found: Registration, sure: Uncertainty, material: np.ndarray
 ) -> None:
     """The true one may be outside once in twenty times, but not by as much again."""
-    here, truth = found.mesh.owned_volumes, found.model.mesh(material).owned_volumes
+    here = found.mesh.owned_volumes
+    truth = found.model.mesh(material).owned_volumes
     for told, volume, true in zip(sure.segments, here, truth, strict=True):
         low, high = told.volume95
         assert (low + high) / 2 == pytest.approx(volume, rel=1e-5)
@@ -291,7 +294,8 @@ def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, r
 
 def test_label_volumes_have_the_radius_of_each_voxel(radii: np.ndarray, folder: Path) -> None:
     with np.load(folder / "labels.npz") as values:
-        labels, found = values["labels"], values["radius95"]
+        labels = values["labels"]
+        found = values["radius95"]
     assert found.shape == labels.shape and found.dtype == np.float32
     assert_array_equal(np.isfinite(found), labels > 0)
     assert radii.min() * 0.9 < np.nanmedian(found) < radii.max()

@@ -116,7 +116,8 @@ def test_the_generating_script_makes_all_parts() -> None:
 
 def test_kubernetes_starts_what_it_should() -> None:
     service, job = yaml.safe_load_all((FOLDER / "train-kubernetes.yaml").read_text())
-    spec, template = job["spec"], job["spec"]["template"]
+    spec = job["spec"]
+    template = job["spec"]["template"]
     pod = template["spec"]
     assert spec["completionMode"] == "Indexed" and spec["completions"] == spec["parallelism"]
     assert service["spec"]["selector"].items() <= template["metadata"]["labels"].items()

@@ -284,7 +284,8 @@ def test_two_objects_in_a_cloud_are_warned_of(
     angle: mereo.Object, points: ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("mereo.api.reconstruct.answer_observation", None)  # which would search long
-    both, sentence = np.concatenate([points, points + np.array([0.5, 0.0, 0.0])]), "two separate clusters of like size"
+    both = np.concatenate([points, points + np.array([0.5, 0.0, 0.0])])
+    sentence = "two separate clusters of like size"
     with pytest.raises(TypeError), pytest.warns(ClustersWarning, match=f"{sentence} .* if they are two, crop to one"):
         mereo.reconstruct(both, angle)
 

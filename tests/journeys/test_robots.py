@@ -226,7 +226,8 @@ WEDGE = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version
 def test_meshes_of_collada_are_as_rviz_shows_them(tmp_path: Path) -> None:
     """In metres by their unit, whichever axis they say is up, and scaled as the robot's file says."""
     (tmp_path / "wedge.dae").write_text(WEDGE)
-    path, mesh = tmp_path / "laptop.urdf", '<mesh filename="wedge.dae" scale="1 1 2"/>'
+    path = tmp_path / "laptop.urdf"
+    mesh = '<mesh filename="wedge.dae" scale="1 1 2"/>'
     path.write_text(LAPTOP.replace('<box size="0.3 0.2 0.02"/>', mesh))
     base = read_robot(path).mesh.segments[0]
     assert_allclose(base.bounds, [[0, 0, 0.1], [0.1, 0.2, 0.7]], atol=1e-9)
@@ -249,7 +250,8 @@ def test_a_scene_file_has_the_joints_and_one_number_moves_both_fingers(
     assert scene.unit_m is not None and np.ptp(scene.rest.bounds[:, 0]) * scene.unit_m == pytest.approx(0.1)
     (slider,) = parameters(random_state(scene, 0))
     assert (slider.group, slider.name) == ("finger", "slide")
-    motion, rng = scene.sample_deformations, example_rng(0, 0)
+    motion = scene.sample_deformations
+    rng = example_rng(0, 0)
     assert isinstance(motion, RandomMotion)
     palm, left, right = (deform(np.zeros((1, 3)))[0] * scene.unit_m for deform in motion(rng))
     assert 0.003 < -left[0] < 0.035 and right[0] == pytest.approx(-0.5 * left[0] + 0.002)
@@ -401,7 +403,8 @@ def test_the_angle_of_a_hinge_is_found_with_its_interval(tmp_path: Path, monkeyp
     assert abs(np.rad2deg(joint.value - true)) < 1.0 and joint.unit == "rad"
     assert_allclose(joint.limits, (0.3, 2.2))
     assert re.fullmatch(r"82\.\d+° \(82\.\d+ to 82\.\d+\)", str(joint))
-    folder, cells = result.save(tmp_path / "result"), f"hinge</td><td style=.*>{re.escape(str(joint))}<"
+    folder = result.save(tmp_path / "result")
+    cells = f"hinge</td><td style=.*>{re.escape(str(joint))}<"
     for page in (result._repr_html_(), content_of_answer(result).joints, content_of_files(folder).joints):
         assert len(re.findall(cells, page)) == 1, "as in the report, from which the last one is"
 
@@ -642,7 +645,8 @@ def test_fingers_that_nothing_shows_are_where_the_encoder_says_in_each_frame(
 ) -> None:
     """Followed from the last frame's state, and found again by a search."""
     assert known.scene is not None and known.joints == ("other finger", "finger")
-    frame, times = tmp_path / "frame.ply", (0.0, 0.1, 0.2, 0.3, 99.0)
+    frame = tmp_path / "frame.ply"
+    times = (0.0, 0.1, 0.2, 0.3, 99.0)
     with mereo.Tracker(known, executor=SynchronousExecutor()) as tracker:
         for time_s, share, seen_parts in zip(times, (0.2, 0.4, 0.6, 0.8, 0.1), (3, 1, 1, 3, 3), strict=True):
             (true,) = write_frame(frame, known.scene, [share], 5, seen_parts=seen_parts)
@@ -713,7 +717,8 @@ def test_a_stream_reads_the_joints_of_each_frame_from_a_folder_or_a_recording(
         states = [make.joints(["wheel", "finger"], [1.0, true[0]])]
         return {"/points": [make.cloud(points[len(points) % 2 :])] * 3, "/joint_states": states}
 
-    bag, options = bags.write_bag(Path("robot.mcap"), 2, topics), ("--object", gripper, "--every-frame", "--joints")
+    bag = bags.write_bag(Path("robot.mcap"), 2, topics)
+    options = ("--object", gripper, "--every-frame", "--joints")
     run_mereo("stream", "frames", *options, "joints", "--unit-m", "1")
     run_mereo("stream", bag, *options, "/joint_states")
     lines = [*map(json.loads, capsys.readouterr().out.splitlines())]

@@ -152,7 +152,8 @@ def test_a_gripper_is_published_with_its_joints_until_it_is_lost(
     moved = [SegmentedMesh((part,)).transformed(T @ rigid(np.eye(3), np.array([x, 0, 0]))) for part, x in parts]
     mesh = SegmentedMesh(tuple(each.segments[0] for each in moved))
     depth = add_depth_noise(render_depth(mesh, CAMERA), 2e-4, default_rng(0)).depth
-    node, frame = ros.ObjectTracker(), image(depth, 5.5)
+    node = ros.ObjectTracker()
+    frame = image(depth, 5.5)
     node._keep_info(INFO)
     kind, topic, keep, _ = node.create_subscription.call_args_list[0].args
     assert topic == "joint_states"

@@ -96,7 +96,8 @@ def test_the_scene_is_checked(folder: Path, capsys: pytest.CaptureFixture) -> No
 def test_a_state_that_was_held_out_is_found(folder: Path) -> None:
     assert run_command(folder, "reconstruct", "--unit-m", "1") == 0
     assert read_json(folder / "result/summary.json")["registration"]["located_by"] == "search"
-    scene, view = mereo.load_scene(str(folder / "organ.yaml")), held_out_view(folder)
+    scene = mereo.load_scene(str(folder / "organ.yaml"))
+    view = held_out_view(folder)
     assert scene.unit_m is not None
     truth = truth_grid(view.mesh.with_vertices([scene.unit_m * part.vertices for part in view.mesh.segments]), 40)
     found = read_segmented_mesh(folder / "result/segments.glb")

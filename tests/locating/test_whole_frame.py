@@ -123,7 +123,8 @@ def test_an_object_among_others_is_known_at_its_place(
 
 
 def test_the_covariance_of_a_rigid_objects_pose_is_that_of_its_points(found: mereo.Result) -> None:
-    registered, covariance = found.registered, found.covariance
+    registered = found.registered
+    covariance = found.covariance
     assert registered is not None and registered.uncertainty is not None and covariance is not None
     arms = registered.material - registered.pose()[:3, 3]
     turns = np.cross(np.eye(3), arms[:, None]).swapaxes(1, 2)  # by a turn about each axis
@@ -240,21 +241,26 @@ def on_angle(placed: SegmentedMesh) -> tuple[int, int]:
 
 
 def looked_at(
-    image: DepthImage, placed: SegmentedMesh, angle: mereo.Object, config: mereo.IsolationConfig
+    image: DepthImage,
+    placed: SegmentedMesh,
+    angle: mereo.Object,
+    config: mereo.IsolationConfig,
+    outline: Outline = Outline(),  # noqa: B008 (immutable)
 ) -> list[np.ndarray]:
-    """Regions that would be looked at; what comes of it does not matter."""
-    registrar, looked = angle.registrar("auto"), list[np.ndarray]()
+    """Regions that are looked at for the first place, were its outline this one."""
+    registrar = angle.registrar("auto")
+    looked = list[np.ndarray]()
     assert registrar is not None
 
     def look(frame: WholeFrame, mask: np.ndarray) -> Place:
         looked.append(mask)
-        return Place(mask, (), placed, Outline())
+        return Place(mask, (), placed, outline)
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(WholeFrame, "look", look)
         seen = find_object(mereo.load_frame(image, unit_m=1.0), config)
         assert is_whole(seen, registrar)
-        assert len(list(WholeFrame.of(seen, registrar).places())) == min(1, len(looked))
+        assert next(WholeFrame.of(seen, registrar).places()).mask is looked[0]
     return looked
 
 
@@ -262,16 +268,21 @@ def test_only_what_is_seen_at_a_point_is_looked_at(
     image: DepthImage, placed: SegmentedMesh, angle: mereo.Object, on_angle: tuple[int, int]
 ) -> None:
     every = looked_at(image, placed, angle, mereo.IsolationConfig())
-    (column, row), at_it = on_angle, looked_at(image, placed, angle, mereo.IsolationConfig(point=on_angle))
+    column, row = on_angle
+    at_it = looked_at(image, placed, angle, mereo.IsolationConfig(point=on_angle))
     assert 0 < len(at_it) < len(every) and all(mask[row - 2 : row + 3, column].any() for mask in at_it)
     (can,) = looked_at(image, placed, angle, mereo.IsolationConfig(point=CAN))
     assert can[CAN[1], CAN[0]] and not can[row, column]
+    evident = looked_at(image, placed, angle, mereo.IsolationConfig(), Outline(hits=200))
+    assert len(evident) == 1, "the next region is looked at where that is not the object"
 
 
 def test_a_box_is_looked_through_where_it_shows_more_than_the_object(
     image: DepthImage, placed: SegmentedMesh, angle: mereo.Object
 ) -> None:
-    frame, registrar, (low, high) = mereo.load_frame(image, unit_m=1.0), angle.registrar("auto"), placed.bounds
+    frame = mereo.load_frame(image, unit_m=1.0)
+    registrar = angle.registrar("auto")
+    low, high = placed.bounds
     assert registrar is not None
     tight = mereo.IsolationConfig(box=(*low, *high))
     for config in (tight, mereo.IsolationConfig(box=BOX, remove_plane=True)):
@@ -347,7 +358,8 @@ def test_a_large_image_is_thinned_to_pixels_that_are_its_own() -> None:
     depth = default_rng(0).uniform(0.9, 1.1, (700, 900))
     thin, every = thinned(DepthImage(depth, camera), 0.3)
     assert every == 5 and thin.depth.shape == (140, 180)
-    points, places = depth[2::5, 2::5, None] * camera.directions()[2::5, 2::5], thin.camera.directions()
+    points = depth[2::5, 2::5, None] * camera.directions()[2::5, 2::5]
+    places = thin.camera.directions()
     assert_allclose(thin.depth[..., None] * places, points, atol=1e-12)
     assert thinned(DepthImage(depth, camera), 0.05)[1] == 1
 
@@ -390,7 +402,8 @@ def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
     field = gaussian_filter(rng.normal(size=depth.shape), 8)
     shared = np.where(clean.valid, clean.depth + level * clean.depth * field / field.std(), 0.0)
     noisy = add_depth_noise(DepthImage(shared, clean.camera), std, rng)
-    distance, shown = float(np.median(depth[depth > 0])), depth > 0
+    distance = float(np.median(depth[depth > 0]))
+    shown = depth > 0
     # of single pixels' noise half may pass for shared, as things on the plane widen what is left over
     noise = shared_noise(noisy, shown)
     assert noise.pixel == 1 / CAMERA.focal_x_px

@@ -161,7 +161,8 @@ SEED, OFF = 700_000, 3.0
 
 def views(name: str, sensor: Sensor, which: Iterable[int]) -> list[tuple[ndarray, ndarray]]:
     """Points of views, and whether each is on the object."""
-    scene, settings = load_scene(name).for_seed(SEED), GenerateConfig(sensor=SENSORS[sensor])
+    scene = load_scene(name).for_seed(SEED)
+    settings = GenerateConfig(sensor=SENSORS[sensor])
     seen = (sample_view(scene, settings, example_rng(SEED, index)) for index in which)
     clouds = ((view, view.depth.to_points().points) for view in seen)
     return [(points, np.asarray(Solids(view.mesh).nearest(points).distance) < OFF) for view, points in clouds]

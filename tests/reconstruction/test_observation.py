@@ -138,7 +138,8 @@ def stored_at(pose: ndarray, points: ndarray) -> bytes:
 
 
 def test_a_stated_viewpoint_is_used_where_the_points_fit_it(tmp_path: Path) -> None:
-    path, based = tmp_path / "c.pcd", transform_points(BASE, CAP.astype(float))
+    path = tmp_path / "c.pcd"
+    based = transform_points(BASE, CAP.astype(float))
     path.write_bytes(stored_at(BASE, based))
     with pytest.warns(
         InputWarning, match=r"c.pcd states a camera's pose \(VIEWPOINT\); .* moved into the camera's axes"
@@ -183,7 +184,8 @@ def test_a_camera_pose_moves_any_cloud_into_the_cameras_axes(folder: Path) -> No
 
 
 def test_coordinates_of_a_map_keep_their_digits(tmp_path: Path) -> None:
-    offset, path = np.array([500000.25, 5400000.5, 300.125]), tmp_path / "c.xyz"
+    offset = np.array([500000.25, 5400000.5, 300.125])
+    path = tmp_path / "c.xyz"
     np.savetxt(path, CAP + offset, fmt="%.6f")
     with pytest.raises(
         ValueError, match=r"lie around \(50000.*, .* times their extent from the origin, .*--camera-pose F"
@@ -297,7 +299,8 @@ def test_a_surface_that_no_camera_can_have_seen_is_known_by_its_normals() -> Non
     sphere = normals + np.array([0.0, 0.0, 5.0])
     ahead = (normals * sphere).sum(axis=1) < 0
     whole = PointCloud(sphere, normals)
-    cap, inward = whole.rows(ahead), PointCloud(sphere[ahead], -normals[ahead])
+    cap = whole.rows(ahead)
+    inward = PointCloud(sphere[ahead], -normals[ahead])
     torn = PointCloud(sphere, normals * rng.choice([-1.0, 1.0], (3000, 1)))
     for name, cloud, extent in (
         ("all around", whole, "surface"),

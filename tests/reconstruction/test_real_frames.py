@@ -134,7 +134,8 @@ def test_a_bottle_before_a_stereo_camera_is_believed_without_a_dent(
     """
     rest, placed = masked_bottle(tmp_path, name)
     bottle = load_object(STEREO / "schauma.obj", units="m", deformations=way)
-    depth, mask = STEREO / f"depth_camera_image_{name}.png", {"mask": tmp_path / "mask.png"} if masked else {}
+    depth = STEREO / f"depth_camera_image_{name}.png"
+    mask = {"mask": tmp_path / "mask.png"} if masked else {}
     found = reconstruct(depth, bottle, intrinsics=tmp_path / "camera.json", **mask)
     assert found.known is True and found.registration is not None and found.registration.method == "rest"
     T = found.pose

@@ -87,7 +87,8 @@ def test_specks_and_gaps_below_a_voxel_are_no_parts() -> None:
 
 
 def test_files(answer: Answer, tmp_path: Path) -> None:
-    frame, result = answer.seen.frame.axes, answer.reconstruction
+    frame = answer.seen.frame.axes
+    result = answer.reconstruction
     (tmp_path / "out").mkdir()
     write_answer(tmp_path / "out", answer)
     files = {"labels.npz", "preview.png", "report.html", "segments.glb", "summary.json"}
@@ -211,7 +212,8 @@ def test_a_bad_frame_is_its_own(tmp_path: Path, loads: list[str], capsys: pytest
 def test_results_that_are_there_are_kept_without_force(
     tmp_path: Path, loads: list[str], capsys: pytest.CaptureFixture
 ) -> None:
-    folder, out = frames(tmp_path / "frames", "a.npy"), tmp_path / "out"
+    folder = frames(tmp_path / "frames", "a.npy")
+    out = tmp_path / "out"
     (out / "a").mkdir(parents=True)
     (out / "a/mine.txt").write_text("keep")
     for options, sentence in (((), "exists and is not empty"), (("--force",), "not written by this version of mereo")):

@@ -94,7 +94,8 @@ def occlude(view: View, kind: Cut, sensor: SensorConfig = SENSORS["paper"], wall
     backdrop = Backdrop(AWAY, farthest(solids, AWAY) + 60.0) if wall else None
     choices = [Surroundings((), backdrop)]
     if kind != "none":
-        points, reach = view.depth.to_points().points, float(norm(rays[:, :2], axis=1).max())
+        points = view.depth.to_points().points
+        reach = float(norm(rays[:, :2], axis=1).max())
         occluders = [sample_occluder(kind, points, reach, 1 / sensor.metres_per_unit, rng) for _ in range(8)]
         choices = [Surroundings(each, backdrop) for each in occluders]
     shown = [int((around.join(solids.first_hit(rays), rays)[1] == OBJECT).sum()) for around in choices]
@@ -112,7 +113,8 @@ def surrounded(image: ndarray) -> ndarray:
 def test_each_line_is_empty_up_to_what_it_met_be_that_an_occluder_or_a_wall(views: list[View], kind: Cut) -> None:
     for view in views:
         cut = occlude(view, kind)
-        seen, lines = cut.seen, cut.found.lines
+        seen = cut.seen
+        lines = cut.found.lines
         rows, columns = pixels(lines.past, seen.whole.camera)
         # each past line ends at what was measured there, and no part of the true object is before that
         assert_allclose(lines.past[:, 2], seen.whole.depth[rows, columns])
@@ -136,7 +138,8 @@ def test_under_sensors_and_wrong_masks_few_lines_are_wrong(views: list[View], se
     for view in views:
         for kind in CUTS:
             cut = occlude(view, kind, SENSORS[sensor])
-            seen, lines = cut.seen, cut.found.lines
+            seen = cut.seen
+            lines = cut.found.lines
             alone = cut.alone.depth[pixels(lines.past, seen.whole.camera)]
             wrong += int(((alone > 0) & (alone < lines.past[:, 2] - 1)).sum())
             total += len(lines.past)
@@ -166,9 +169,11 @@ def test_what_a_bare_cloud_is_cut_by_is_what_it_is_declared_to_be(views: list[Vi
 
 def test_what_was_to_be_seen_and_was_not_counts_where_nothing_says_what_is_there(views: list[View]) -> None:
     triangles = np.concatenate([segment.vertices[segment.faces] for segment in views[0].mesh.segments])
-    points, nothing = views[0].depth.to_points().points, np.empty((0, 3))
+    points = views[0].depth.to_points().points
+    nothing = np.empty((0, 3))
     is_left = points[:, 0] < np.median(points[:, 0])
-    left, right = points[is_left], points[~is_left]
+    left = points[is_left]
+    right = points[~is_left]
     assert Evidence.of(points, lines=SightLines.of_cloud("unknown")).unseen(triangles) < 0.02
     assert 0.3 < Evidence.of(left, lines=SightLines.of_cloud("unknown")).unseen(triangles) < 0.7
     assert Evidence.of(left, lines=SightLines.of_cloud("past")).unseen(triangles) == 0.0  # ruled out

@@ -263,7 +263,8 @@ def test_names_on_standard_input_are_frames(
 
 
 def test_sources_that_are_none_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    reading, isolation = InputConfig(), IsolationConfig()
+    reading = InputConfig()
+    isolation = IsolationConfig()
     with pytest.raises(FileNotFoundError, match="does not exist; a folder that can be watched is needed: make it"):
         watched_frames(str(tmp_path / "nowhere"), reading, isolation)
     with pytest.raises(FileNotFoundError, match="does not exist; a folder of frames"):

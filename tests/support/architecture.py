@@ -130,7 +130,7 @@ BUDGET = {
     "src/mereo_serving": (10_600, 13),
     "src/mereo_viewer": (12_030, 5),
     "src/mereo_experiments": (11_230, 16),
-    "tests": (294_350, 139),
+    "tests": (294_320, 139),
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
