@@ -273,7 +273,9 @@ def record(frame: BankView) -> dict[str, Any]:
     """All arrays of one frame."""
     registrar = registrar_of(frame.name)
     model = registrar.model
-    started, answer, refused = time.perf_counter(), None, ""
+    started = time.perf_counter()
+    answer = None
+    refused = ""
     with recording() as recorder:
         try:
             answer = answering.answer_frame(frame.seen, None, registrar, scene_unit=frame.scene_unit)
@@ -282,7 +284,8 @@ def record(frame: BankView) -> dict[str, Any]:
         seconds = time.perf_counter() - started
     truth, material, factor = None, None, 1.0
     if frame.view is not None:
-        factor, T = size_of(frame), np.eye(4) if answer is None else answer.T_camera_input
+        factor = size_of(frame)
+        T = np.eye(4) if answer is None else answer.T_camera_input
         truth = truth_grid(frame.view.mesh.transformed(T), CELLS)
         material = transform_points(T, factor * true_material(frame.view, model))
         from_truth(recorder, material, model)
@@ -312,7 +315,8 @@ def packed(
     problems = list({id(each.problem): each.problem for each in recorder.candidates}.values())
     number_of = {id(problem): number for number, problem in enumerate(problems)}
     evidences = list({id(problem.evidence.points): problem.evidence for problem in problems}.values())
-    rows, arrays = list[dict[str, Any]](), dict[str, Any]()
+    rows = list[dict[str, Any]]()
+    arrays = dict[str, Any]()
     final = None if answer is None or answer.registration is None else answer.registration
     offsets, ruled, eigenvalues, places = (list[np.ndarray]() for _ in range(4))
     for candidate in recorder.candidates:

@@ -117,7 +117,8 @@ def least(frame: Frame, numbers: Sequence[int], handicap: Callable[[dict[str, An
 
 def today(frame: Frame) -> int | None:
     """The fit's own rules (``search.search``, ``modes.resting``, ``register.is_drawn``), from the terms alone."""
-    rows, problems = frame.rows, frame.facts["problems"]
+    rows = frame.rows
+    problems = frame.facts["problems"]
     fits = [n for n in frame.of_stages(FITTED) if frame.problem(rows[n])["modes"] == problems[0]["modes"]]
     given = [n for n in fits if rows[n]["stage"] != "heavier"]
     if not given:
@@ -129,7 +130,8 @@ def today(frame: Frame) -> int | None:
     def handicap(row: dict[str, Any]) -> float:
         return WHOLE if is_open and frame.problem(row)["other_lines"] == "unknown" else 0.0
 
-    chosen, heavier = least(frame, given, handicap), frame.of_stages(["heavier"])
+    chosen = least(frame, given, handicap)
+    heavier = frame.of_stages(["heavier"])
     if not rows[chosen]["explains"] and heavier and rows[heavier[-1]]["cloud"] < HELPS * rows[chosen]["cloud"]:
         chosen = heavier[-1]
     # of the last problem, in which each step that was tried is a candidate
@@ -137,10 +139,12 @@ def today(frame: Frame) -> int | None:
         [least(frame, same(frame, numbers, numbers[-1]))] if numbers else []
         for numbers in (frame.of_stages([stage]) for stage in ("settled", "rest"))
     )
-    chosen, is_rigid = [chosen, *settled][-1], problems[0]["modes"] == 0
+    chosen = [chosen, *settled][-1]
+    is_rigid = problems[0]["modes"] == 0
     if rest and (is_rigid or rows[rest[0]]["total"] - rows[chosen]["total"] < rows[chosen]["narrowing"]):
         chosen = rest[0]
-    drawn, draws = frame.facts["drawn"], frame.of_stages(["draws"])
+    drawn = frame.facts["drawn"]
+    draws = frame.of_stages(["draws"])
     if drawn is not None and draws:
         number = min(draws, key=lambda n: abs(rows[n]["total"] - drawn["misfit"]))
         ends = frame.of_stages(["draws settled"])
@@ -176,7 +180,8 @@ class Score:
 
 def score(frame: Frame, chooser: Chooser) -> Score | None:
     """Score of a chooser in a frame; None where it names nothing."""
-    number, limit = chooser(frame), best(frame)
+    number = chooser(frame)
+    limit = best(frame)
     if number is None or limit is None:
         return None
     lost = float(frame.miou[limit] - frame.miou[number])

@@ -153,7 +153,8 @@ def bottle() -> trimesh.Trimesh:
     mesh = trimesh.creation.revolve(np.vstack([*pieces, profile[-1:]]), sections=40)
     x, y, z = mesh.vertices.T
     flat = np.interp(z, [0.14, 0.157], [1.0, 0.0])  # the body is of superellipses, the cap is round
-    power, angle = 2 + 0.6 * flat, np.arctan2(y, x)
+    power = 2 + 0.6 * flat
+    angle = np.arctan2(y, x)
     reach = (np.abs(np.cos(angle)) ** power + np.abs(np.sin(angle)) ** power) ** (-1 / power)
     mesh.vertices = np.stack([x * reach, y * reach * (1 - 0.42 * flat), z], axis=1)
     return mesh

@@ -101,7 +101,8 @@ def bank_view(name: str, condition: str, number: int) -> BankView:
     scene = scene_of(name)
     kind = OTHERS[number % len(OTHERS)] if condition == "other" else ""
     if condition == "other":
-        seen, view = other_view(scene, kind, rng), None
+        seen = other_view(scene, kind, rng)
+        view = None
     elif condition in DESKS:
         seen, view = desk_view(scene, condition, number, rng)
     else:
@@ -147,7 +148,8 @@ def masked(whole: DepthImage, mask: Bool[np.ndarray, "h w"] | None) -> Observati
 
 def stitched(view: View, rng: np.random.Generator, cameras: int = 3, points: int = 2500) -> PointCloud:
     """Surface with normals, as a scanner stitches it from several sides, no camera's; noise is a tenth of a unit."""
-    middle, size = view.mesh.bounds.mean(axis=0), float(np.ptp(view.mesh.bounds, axis=0).max())
+    middle = view.mesh.bounds.mean(axis=0)
+    size = float(np.ptp(view.mesh.bounds, axis=0).max())
     seen = list[np.ndarray]()
     for _ in range(cameras):
         away = rng.normal(size=3)
@@ -156,7 +158,8 @@ def stitched(view: View, rng: np.random.Generator, cameras: int = 3, points: int
         image = observe(solids, Camera.from_fov(96, 96, 0.5), 0.1, SensorConfig(), rng).image
         seen.append(image.to_points().points @ T[:3, :3].T + T[:3, 3])
     every = np.concatenate(seen)
-    chosen, solids = every[rng.permutation(len(every))[:points]], Solids(view.mesh)
+    chosen = every[rng.permutation(len(every))[:points]]
+    solids = Solids(view.mesh)
     normals = solids.face_normals(solids.nearest(chosen).face)
     return PointCloud(chosen, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30))
 
@@ -226,7 +229,8 @@ def other_view(scene: Scene, kind: str, rng: np.random.Generator) -> Observation
 
 def other_cloud(scene: Scene, kind: str, view: View, rng: np.random.Generator) -> PointCloud | None:
     """Cloud of one kind of ``OTHERS``; None where nothing is seen."""
-    points, middle = view.depth.to_points().points, view.mesh.bounds.mean(axis=0)
+    points = view.depth.to_points().points
+    middle = view.mesh.bounds.mean(axis=0)
     size = float(np.ptp(view.mesh.bounds, axis=0).max())
     across = np.ptp(points, axis=0)[:2].argmax()
     away = points[:, across]
@@ -251,7 +255,8 @@ def other_cloud(scene: Scene, kind: str, view: View, rng: np.random.Generator) -
 
 def other_mesh(scene: Scene, kind: str, view: View, rng: np.random.Generator) -> SegmentedMesh:
     """Another thing, another object, or the object mirrored or of another size, where the object was."""
-    middle, size = view.mesh.bounds.mean(axis=0), float(np.ptp(view.mesh.bounds, axis=0).max())
+    middle = view.mesh.bounds.mean(axis=0)
+    size = float(np.ptp(view.mesh.bounds, axis=0).max())
     if kind == "mirrored" and scene.name in CHIRAL:
         flipped = [
             replace(part, vertices=middle + (part.vertices - middle) * [-1, 1, 1], faces=part.faces[:, ::-1])
@@ -325,7 +330,8 @@ def things_around(size: float, inner: float, rng: np.random.Generator) -> list[P
         for _ in range(30):
             angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(inner, inner + 2 * size)
             other = thing.moved(np.array([far * np.cos(angle), far * np.sin(angle), 0.0]))
-            at, radius = other.mesh.bounds.mean(axis=0)[:2], other.radius
+            at = other.mesh.bounds.mean(axis=0)[:2]
+            radius = other.radius
             apart = [np.linalg.norm(at - each.mesh.bounds.mean(axis=0)[:2]) - each.radius for each in placed]
             if np.linalg.norm(at) > inner + 0.8 * radius and all(gap > 0.9 * radius for gap in apart):
                 placed.append(other)

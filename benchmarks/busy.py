@@ -50,8 +50,10 @@ def measure(queries: int, rounds: int, beside: int) -> None:
     from mereo.synthesis.sample_views import load_view
     from mereo_experiments.speed.stages import random_points
 
-    model, view = load_model("bunny"), load_view("bunny")
-    code, points = model.encode(view.depth.to_points()), random_points(view, queries, seed=1)
+    model = load_model("bunny")
+    view = load_view("bunny")
+    code = model.encode(view.depth.to_points())
+    points = random_points(view, queries, seed=1)
 
     def seconds() -> float:
         start = time.perf_counter()
@@ -83,7 +85,9 @@ def row(policy: str | None, threads: int | None, options: argparse.Namespace) ->
         *(f"--{k}={vars(options)[k]}" for k in ("queries", "rounds", "beside")),
     ]
     told = subprocess.run(command, env=variables, stdout=subprocess.PIPE, text=True, check=True).stdout.split()
-    used, alone, busy = int(told[0]), float(told[1]), float(told[2])
+    used = int(told[0])
+    alone = float(told[1])
+    busy = float(told[2])
     fair = alone * max(1.0, (used + options.beside) / cores())
     print(f"| {policy or 'not set'} | {used} | {alone:.2f} | {fair:.2f} | {busy:.2f} | {busy / fair:.2f} |", flush=True)
     return busy / fair

@@ -68,7 +68,8 @@ def line(*cells: str) -> str:
 
 
 def measure(name: str, sensors: list[Sensor], rows: list[int], views: int) -> None:
-    scene, model = load_scene(name).for_seed(TEST_SEED_START), load_model(name)
+    scene = load_scene(name).for_seed(TEST_SEED_START)
+    model = load_model(name)
     print(f"\n{name}: {views} views, seed {TEST_SEED_START}\n{line(*HEADINGS)}")
     for sensor in sensors:
         for distance_m, size, bins in (ROWS[row] for row in rows):

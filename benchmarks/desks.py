@@ -32,7 +32,8 @@ def answer_desk(name: str, kind: str, number: int, seed: int, all_places: bool) 
     """Make a desk, look for the object, and say what came of it."""
     rng = np.random.default_rng([seed, *map(ord, f"{name} {kind}"), number])
     seen, view = desk_view(scene_of(name), kind, number, rng)
-    registrar, started = registrar_of(name), (time.perf_counter(), time.process_time())
+    registrar = registrar_of(name)
+    started = (time.perf_counter(), time.process_time())
     frame = WholeFrame.of(seen, registrar, 1.0)
     answers = list(answers_in(frame, None, most=LOOKS if all_places else 1))
     best = instances_in(frame, answers, False) if answers else []

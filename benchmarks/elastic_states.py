@@ -51,7 +51,8 @@ def main() -> None:
             rngs = [example_rng(arguments.seed, index) for index in range(arguments.views)]
             views = [sample_view(scenes[states], GenerateConfig(), rng) for rng in rngs]
             for kind, model in models.items():
-                rows, start = [], time.perf_counter()
+                rows = []
+                start = time.perf_counter()
                 for view in views:
                     cloud = CloudToFit(view.depth.to_points().points, 1.0)
                     fitted = search_modes(cloud, model, Registrar(None, model).config)

@@ -35,7 +35,8 @@ def measure(encoder: Encoder) -> None:
         network.encoder.add_codes(BATCH, length=1.0)
     cloud = torch.nn.functional.normalize(torch.randn(BATCH, network.config.points, 3), dim=-1)
     viewpoint = torch.tensor([[0.0, 0.0, -8.0]])
-    queries, index = torch.randn(BATCH, QUERIES, 3), torch.arange(BATCH)
+    queries = torch.randn(BATCH, QUERIES, 3)
+    index = torch.arange(BATCH)
 
     def step() -> None:
         prediction, coarse = network(cloud, viewpoint.expand(BATCH, 3), queries, index)

@@ -57,8 +57,10 @@ def by_side(weights: str, views: int, cells: int) -> str:
     wrong, shell = np.zeros(2), np.zeros(2)
     for index in range(views):
         view = sample_view(scene, GenerateConfig(), example_rng(TEST_SEED_START, index))
-        cloud, truth = view.depth.to_points(), truth_grid(view.mesh, cells)
-        occupied, seen = truth.grid.labels > 0, cKDTree(cloud.points)
+        cloud = view.depth.to_points()
+        truth = truth_grid(view.mesh, cells)
+        occupied = truth.grid.labels > 0
+        seen = cKDTree(cloud.points)
         found = predict_grid(model, cloud, truth) > 0
         wrong += near_and_elsewhere((found != occupied) & truth.kept, truth, seen)
         shell += near_and_elsewhere(occupied & ~binary_erosion(occupied), truth, seen)
@@ -100,7 +102,8 @@ def rest_errors(model: Model, data: Dataset) -> dict[str, list[float]]:
 @torch.no_grad()
 def query_scores(model: Model, data: Dataset) -> dict[str, Scores]:
     """Scores on stored queries by which examples they are of and what the network is told."""
-    network, classes = model.network, len(model.names) + 1
+    network = model.network
+    classes = len(model.names) + 1
     last = torch.arange(len(data) - HELD_OUT, len(data))
 
     def answer(batch: Batch, alignment: Alignment | None = None) -> Float[Tensor, "b q c"]:
@@ -111,7 +114,8 @@ def query_scores(model: Model, data: Dataset) -> dict[str, Scores]:
         return network.query(code, batch.positions).logits.softmax(dim=-1)
 
     def averaged(index: Int[Tensor, " b"], batch: Batch) -> Float[Tensor, "b q c"]:
-        draws, stored = Draws.of(0), data.read(index)
+        draws = Draws.of(0)
+        stored = data.read(index)
         seen = stored["cloud"], stored["cloud_count"].long()
         clouds = [choose_points(*seen, network.config.points, FEWER, draws) for _ in range(CLOUDS)]
         return torch.stack([answer(replace(batch, cloud=cloud)) for cloud in clouds]).mean(dim=0)
@@ -144,7 +148,8 @@ def main() -> None:
     for name in options.weights:
         print(by_side(name, options.views, options.cells), flush=True)
     if options.dataset:
-        model, data = load_model(options.weights[0]), Dataset.load(options.dataset)
+        model = load_model(options.weights[0])
+        data = Dataset.load(options.dataset)
         for name, values in rest_errors(model, data).items():
             print(f"{options.weights[0]}, {name}: mean {np.mean(values):.3f}, median {np.median(values):.3f}")
         for name, scores in query_scores(model, data).items():

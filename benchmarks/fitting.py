@@ -103,7 +103,8 @@ def row(
         values = (alone.iou, alone.miou, *fitted(modes.registration, grid), *fitted(best, grid))
         table.append((*values, modes.seconds, best.seconds, best.accepted, best.method == "draws", best.explained))
         print(f"  {case.name}: " + " ".join(f"{float(value):.3f}" for value in table[-1]), flush=True)
-    mean, middle = np.mean(table, axis=0), np.median(table, axis=0)
+    mean = np.mean(table, axis=0)
+    middle = np.median(table, axis=0)
     ends = []
     for parts in (np.concatenate(seen), np.concatenate(hidden)):
         ends.append("{:.2f} / {:.2f}".format(*np.quantile(parts, [0.5, 0.95])) if len(parts) else "-")
@@ -122,7 +123,8 @@ def main() -> None:
     options = parser.parse_args()
     rows = []
     for name in ["bunny"] if options.scans else options.objects:
-        network, scene = load_model(name), load_scene(name)
+        network = load_model(name)
+        scene = load_scene(name)
         model = scene_model(scene)
         states = DrawnStates.of(scene, model) if options.draws else None
         cases = scans(scene) if options.scans else views(scene, model, options.seed, options.first, options.views)

@@ -83,7 +83,8 @@ class Run:
         answers, seconds, busy_s = [], [], []
         with Tracker(registrar, executor=SynchronousExecutor()) as tracker:
             for shot in shots:
-                started, worked = time.perf_counter(), time.process_time()
+                started = time.perf_counter()
+                worked = time.process_time()
                 answers.append(tracker.follow(observe(shot.cloud), shot.time_s, scene_unit=1.0))
                 seconds.append(time.perf_counter() - started)
                 busy_s.append(time.process_time() - worked)
@@ -119,7 +120,8 @@ class SceneShots:
 
     def _shots(self, settings: SequenceConfig, seed: int, more_noise: float = 0.0) -> Shots:
         moments = list(sequence(self.scene, settings, self.sensor, seed))
-        rng, last = np.random.default_rng(11), max(len(moments) - 1, 1)
+        rng = np.random.default_rng(11)
+        last = max(len(moments) - 1, 1)
         images = [add_depth_noise(each.seen.image, more_noise * i / last, rng) for i, each in enumerate(moments)]
         return [Shot(each.time_s, image.to_points(), each.mesh) for each, image in zip(moments, images, strict=True)]
 
@@ -137,7 +139,8 @@ class ScanShots:
     def still(self, seed: int) -> Shots:
         """A scan of whose points another half is there in each frame."""
         cloud, mesh = self._posed(seed)
-        rng, count = np.random.default_rng(seed), len(cloud.points)
+        rng = np.random.default_rng(seed)
+        count = len(cloud.points)
         kept = (rng.choice(count, count // 2, replace=False) for _ in range(STILL))
         return [Shot(i / self.settings.rate, PointCloud(cloud.points[rows]), mesh) for i, rows in enumerate(kept)]
 
@@ -152,10 +155,12 @@ class ScanShots:
 
     def _shots(self, seed: int, settings: SequenceConfig) -> Iterator[Shot]:
         cloud, mesh = self._posed(seed)
-        sight, size = cloud.points.mean(axis=0), float(np.ptp(cloud.points, axis=0).max())
+        sight = cloud.points.mean(axis=0)
+        size = float(np.ptp(cloud.points, axis=0).max())
         phase = np.random.default_rng(seed).uniform(0, 2 * np.pi, size=4)
         for i in range(settings.frames):
-            T, swing = np.eye(4), np.sin(np.pi * i / settings.rate + phase)
+            T = np.eye(4)
+            swing = np.sin(np.pi * i / settings.rate + phase)
             T[:3, :3] = Rotation.from_rotvec(0.35 * swing[0] * sight / np.linalg.norm(sight)).as_matrix()
             T[:3, 3] = 0.125 * size * swing[1:]
             yield Shot(i / settings.rate, PointCloud(transform_points(T, cloud.points)), mesh.transformed(T))
@@ -164,7 +169,8 @@ class ScanShots:
 def subject(name: str, options: argparse.Namespace) -> tuple[Registrar, SceneShots | ScanShots]:
     """Registrar of an object, set up, and its sequences."""
     thing = load_object("bunny" if name == "scans" else name)
-    registrar, scene = thing.registrar("auto"), thing.scene
+    registrar = thing.registrar("auto")
+    scene = thing.scene
     assert registrar is not None
     registrar.prepare()
     if isinstance(thing.network, Model):

@@ -103,7 +103,8 @@ def rival_sort_sample(
 
 def seconds(function: Callable[[], Any]) -> tuple[float, float]:
     """Of the clock, of the CPU."""
-    clock, cpu = time.perf_counter(), time.process_time()
+    clock = time.perf_counter()
+    cpu = time.process_time()
     function()
     return time.perf_counter() - clock, time.process_time() - cpu
 

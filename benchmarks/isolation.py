@@ -40,7 +40,8 @@ def measure(weights: str, sensor: Sensor, views: int, cells: int) -> None:
     for index in range(views):
         settings = GenerateConfig(sensor=SENSORS[sensor])
         view = sample_view(scene, settings, example_rng(TEST_SEED_START, index))
-        cloud, truth = view.depth.to_points(), truth_grid(view.mesh, cells)
+        cloud = view.depth.to_points()
+        truth = truth_grid(view.mesh, cells)
         for way, config in WAYS.items():
             start = time.process_time()
             left = find_object(observe(cloud).frame, config).cloud

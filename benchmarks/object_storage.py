@@ -76,7 +76,8 @@ def make(shards: int) -> tuple[dict[str, Any], list[bytes]]:
         "shard_size": EXAMPLES,
         "version": "0",
     }
-    rng, key = np.random.default_rng(SEED), dataset_key(manifest)
+    rng = np.random.default_rng(SEED)
+    key = dataset_key(manifest)
     return manifest, [pack_tensors(shard(rng), {"dataset": key, "first": n * EXAMPLES}) for n in range(shards)]
 
 
@@ -98,7 +99,8 @@ def shard(rng: np.random.Generator) -> dict[str, np.ndarray]:
 
 def rates(place: Place, manifest: dict[str, Any], shards: list[bytes]) -> tuple[float, float]:
     """MB/s of writing and of reading."""
-    megabytes, began = sum(map(len, shards)) / 1e6, time.perf_counter()
+    megabytes = sum(map(len, shards)) / 1e6
+    began = time.perf_counter()
     for number, content in enumerate(shards):
         write_whole(place / shard_name(number), content)
     written = megabytes / (time.perf_counter() - began)

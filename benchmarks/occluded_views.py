@@ -117,7 +117,8 @@ def occlude(
 
     Raises ``ValueError`` where no object pixel, or no share from 0 to 1, is there.
     """
-    solids, camera = Solids(view.mesh), view.depth.camera
+    solids = Solids(view.mesh)
+    camera = view.depth.camera
     if not 0 <= share < 1:
         raise ValueError(f"the hidden share is {share}; it must be at least 0 and less than 1: give for example 0.3")
     directions = camera.directions().reshape(-1, 3)
@@ -125,7 +126,8 @@ def occlude(
     visible = np.isfinite(hits.distance)
     if not visible.any():
         raise ValueError("the view shows 0 pixels of the object; at least one must be visible: take another view")
-    rays, seen = directions[visible], Hits(hits.distance[visible], hits.normal[visible])
+    rays = directions[visible]
+    seen = Hits(hits.distance[visible], hits.normal[visible])
     placing, measuring = rng.spawn(2)
     occluders: Sequence[Occluding] = ()
     if kind == "screen":

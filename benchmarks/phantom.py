@@ -147,8 +147,12 @@ def fit_modes(vertices: np.ndarray, faces: np.ndarray, modes: np.ndarray, cloud:
     """
     points, normals = cloud
     half = float(np.ptp(vertices, axis=0).max()) / 2
-    k, center = modes.shape[2], vertices.mean(axis=0)
-    R, t, z, moved = np.eye(3), center.copy(), np.zeros(k), vertices
+    k = modes.shape[2]
+    center = vertices.mean(axis=0)
+    R = np.eye(3)
+    t = center.copy()
+    z = np.zeros(k)
+    moved = vertices
     for step in range(40):
         sigma = half * max(noise, 0.15 * 0.85**step)
         place, normal, corners, weights = match(moved, faces, cloud, 0.1 * half)
@@ -159,7 +163,8 @@ def fit_modes(vertices: np.ndarray, faces: np.ndarray, modes: np.ndarray, cloud:
         worth *= np.clip((normal * normals).sum(axis=1), 0, 1) * 0.1 / sigma**2
         metric = worth[:, None, None] * (0.98 * across[:, :, None] * across[:, None] + 0.02 * np.eye(3))
         J = jacobian(place - t, R, np.einsum("pc,pcik->pik", weights, modes[corners]))
-        weighted, flat = np.matmul(metric, J).reshape(-1, 6 + k), J.reshape(-1, 6 + k)
+        weighted = np.matmul(metric, J).reshape(-1, 6 + k)
+        flat = J.reshape(-1, 6 + k)
         A, b = flat.T @ weighted, weighted.T @ error.ravel()
         A[6:, 6:] += np.eye(k)
         b[6:] -= z
@@ -200,7 +205,8 @@ def coherent_point_drift(vertices: np.ndarray, cloud: Points) -> np.ndarray:
     from pycpd import DeformableRegistration
 
     some = np.random.default_rng(0).choice(len(vertices), 1500, replace=False)
-    middle, size = vertices.mean(axis=0), float(np.ptp(vertices, axis=0).max()) / 2
+    middle = vertices.mean(axis=0)
+    size = float(np.ptp(vertices, axis=0).max()) / 2
     source, target = (vertices - middle) / size, (cloud[0] - middle) / size
     drift = DeformableRegistration(X=target, Y=source[some], alpha=2000.0, beta=2.0, w=0.3, max_iterations=60)
     drift.register()
@@ -236,7 +242,8 @@ class Truth:
             covered = f"{(away <= radii[cKDTree(vertices).query(self.hidden)[1]]).mean():.1%}, {np.median(radii):.1f}"
         volume = trimesh.Trimesh(vertices, faces, process=False).volume / self.volume - 1
         iou = (mine & true).sum() / (mine | true).sum()
-        median, most = np.median(away), np.percentile(away, 95)
+        median = np.median(away)
+        most = np.percentile(away, 95)
         return f"{iou:.3f} | {median:5.2f} / {most:5.2f} | {covered} | {100 * volume:+.1f}"
 
 
@@ -259,7 +266,8 @@ def main() -> None:
     folder = parser.parse_args().folder
     rest, rival = (load(folder, name) for name in ("initial-surface", "pbsm_from_endoscope"))
     vertices, faces = np.asarray(rest.vertices), np.asarray(rest.faces, dtype=np.int64)
-    half, truth = float(np.ptp(vertices, axis=0).max()) / 2, Truth(folder, rest)
+    half = float(np.ptp(vertices, axis=0).max()) / 2
+    truth = Truth(folder, rest)
     print("| input | known | method | IoU | hidden, mm | within radius, its median mm | volume, % | s |")
     print("|---|---|---|---|---|---|---|---|")
     for which, name, mesh in (("", "identity", rest), ("B", "rival's file", rival)):
@@ -272,11 +280,13 @@ def main() -> None:
             for name, make in (("rigid", rigid_modes), ("Gaussian process", gaussian_process)):
                 start = time.perf_counter()
                 moved = fit_modes(vertices, faces, make(vertices, half), cloud, noise)
-                row, spent = truth.line(moved, faces), time.perf_counter() - start
+                row = truth.line(moved, faces)
+                spent = time.perf_counter() - start
                 print(f"| {which} | pose given | {name} | {row} | {spent:.1f} |", flush=True)
             if find_spec("pycpd") is not None:
                 start = time.perf_counter()
-                row, spent = truth.line(coherent_point_drift(vertices, cloud), faces), time.perf_counter() - start
+                row = truth.line(coherent_point_drift(vertices, cloud), faces)
+                spent = time.perf_counter() - start
                 print(f"| {which} | pose given | coherent point drift | {row} | {spent:.1f} |", flush=True)
             for known in ("search", "pose given", "underside held"):
                 moved, triangles, radii, spent = answer(which, known)

@@ -174,8 +174,10 @@ def sized(registrar: Registrar) -> Registrar:
 def clouds_like(own: Sequence[PointCloud], seed: int) -> Iterator[tuple[str, PointCloud]]:
     """Clouds made of views of the object, or as large as them, that do not show it whole and alone."""
     for index, cloud in enumerate(own):
-        rng, points = example_rng(seed + 5, index), cloud.points
-        middle, size = points.mean(axis=0), float(np.ptp(points, axis=0).max())
+        rng = example_rng(seed + 5, index)
+        points = cloud.points
+        middle = points.mean(axis=0)
+        size = float(np.ptp(points, axis=0).max())
         across = int(np.ptp(points, axis=0)[:2].argmax())  # of the picture, not along the rays
         ball = rng.normal(size=points.shape)
         ball *= size / 2 / np.linalg.norm(ball, axis=1, keepdims=True)
@@ -299,7 +301,8 @@ def measured(name: str, arguments: argparse.Namespace) -> Measured:
     assert model is None or isinstance(model, Model)
     if model is None:
         assert thing.scene is not None and thing.model is not None
-        scene, unsized = thing.scene, thing.registrar()
+        scene = thing.scene
+        unsized = thing.registrar()
         assert unsized is not None
     else:
         scene = load_scene(arguments.scene or trained_scene(model))
@@ -307,7 +310,9 @@ def measured(name: str, arguments: argparse.Namespace) -> Measured:
             model = replace(model, calibration=calibrate(model, scene, views=arguments.calibration_views, quiet=False))
         unsized = Registrar.of(model, arguments.method, scene)
     registrar = sized(unsized)
-    result, seed, clean = Measured(), arguments.seed, []
+    result = Measured()
+    seed = arguments.seed
+    clean = []
     for kind, view, seen in own_views(scene, arguments.views, seed):
         result.add(kind, answered(seen, model, registrar), view, seen.cloud)
         clean += [(view, seen.cloud)] if kind == "clean" else []

@@ -140,7 +140,8 @@ def theirs(view: Prepared, rivals: dict[str, Rival], grid: TruthGrid) -> dict[st
 def line(name: str, found: list[Row]) -> str:
     """One row of the table."""
     iou, miou = (np.mean([row[i] for row in found]) for i in (0, 1))
-    seconds, failed = np.median([row[2] for row in found]), sum(not row[3] for row in found)
+    seconds = np.median([row[2] for row in found])
+    failed = sum(not row[3] for row in found)
     ends = []
     for part in (4, 5):
         values = np.concatenate([row[part] for row in found])
@@ -182,7 +183,8 @@ def search(name: str, rival: Rival, prepared: list[Prepared]) -> None:
             error = mean_error(rival, rival.default | tuned | {key: value}, prepared)
             print(f"  {key}={value}: {error:.4f}", flush=True)
             if error < least:
-                least, tuned = error, tuned | {key: value}
+                least = error
+                tuned = tuned | {key: value}
     print(f"{name}: {least:.4f} with {tuned}", flush=True)
 
 
@@ -211,7 +213,8 @@ def main() -> None:
     everything: list[Prepared] = []
     rivals: dict[str, Rival] = {}
     for name in ["bunny"] if options.scans else options.objects:
-        network, scene = load_model(name), load_scene(name)
+        network = load_model(name)
+        scene = load_scene(name)
         model = scene_model(scene)
         surface = surface_points(model)
         cases = (

@@ -74,7 +74,8 @@ def draw_scenes(path: str) -> None:
 
 def telling_pixels(views: int) -> Float[np.ndarray, " n"]:
     """Pixels that tell a hand from one turned by half, for each of the views in which it shows."""
-    scene, counts = load_scene("robot"), []
+    scene = load_scene("robot")
+    counts = []
     camera = Camera.from_fov(96, 96, scene.workspace.fov_rad)
     half_turn = Rigid(np.array([np.pi, 0.0, 0.0]), np.zeros(3), np.array(parts.WRIST))
     for index in range(views):

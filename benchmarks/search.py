@@ -90,7 +90,8 @@ def scored(truth: TruthGrid, mesh: SegmentedMesh) -> tuple[float, float]:
 def measured(name: str, condition: str, seed: int, index: int) -> list[float]:
     """IoU, mIoU, seconds, whether explained, and states alike, of one view."""
     frame, mesh = frame_of(name, condition, seed, index)
-    seen, owned = find_object(frame), loaded(name)
+    seen = find_object(frame)
+    owned = loaded(name)
     registrar = owned.registrar()
     assert registrar is not None
     registrar.prepare()

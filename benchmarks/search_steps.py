@@ -53,7 +53,8 @@ class Options:
 
 def main(options: Options) -> None:
     """Search one occluded view, and draw the steps."""
-    scene, settings = load_scene(options.scene), GenerateConfig(image_size=192)
+    scene = load_scene(options.scene)
+    settings = GenerateConfig(image_size=192)
     view = sample_view(scene.for_seed(1), settings, example_rng(1, options.index))
     cut = occlude(view, "screen", options.hidden, np.random.default_rng(options.index), settings)
     seen = find_object(cut.frame())
@@ -80,7 +81,8 @@ def sight_picture(seen: Observation) -> np.ndarray:
     """Depth image in which lines of sight are orange where they met the object, blue past it, red where unknown."""
     depth = seen.frame.depth if seen.frame.whole is None else seen.frame.whole
     assert depth is not None
-    measured, gray = depth.depth[depth.valid], np.zeros(depth.depth.shape)
+    measured = depth.depth[depth.valid]
+    gray = np.zeros(depth.depth.shape)
     gray[depth.valid] = 255 * np.minimum(np.quantile(measured, 0.01) / measured, 1.0)
     picture = np.repeat(gray[:, :, None], 3, axis=2)
     kinds = (

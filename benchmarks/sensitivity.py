@@ -123,14 +123,16 @@ def answer_frames(path: Path) -> None:
     import torch
 
     torch.set_num_threads(1)
-    frames, registrars = pickle.loads(path.read_bytes()), {}
+    frames = pickle.loads(path.read_bytes())
+    registrars = {}
     for frame in frames:
         if frame.name not in registrars:
             thing = load_object(frame.name, device="cpu", precision="float32")
             registrar = thing.registrar()
             assert registrar is not None
             registrars[frame.name] = thing.network, sized(registrar)
-        score, start = 0.0, time.process_time()
+        score = 0.0
+        start = time.process_time()
         try:
             answer = answer_frame(frame.seen, *registrars[frame.name])
             assert answer.registration is not None

@@ -62,7 +62,8 @@ def example_milliseconds(scene: Scene, settings: GenerateConfig, count: int) -> 
 
 
 def measure(name: str, count: int) -> None:
-    scene, clean = load_scene(name), GenerateConfig(noise_std=0.0)
+    scene = load_scene(name)
+    clean = GenerateConfig(noise_std=0.0)
     views = [(view, Solids(view.mesh)) for view in (sample_view(scene, clean, example_rng(1, i)) for i in range(count))]
     milliseconds(views, SensorConfig())  # builds the search structures
     plain, observed = (example_milliseconds(scene, settings, count) for settings in (GenerateConfig(), OBSERVED))

@@ -53,7 +53,8 @@ def frames_of(weights: Sequence[str], count: int, folder: Path) -> list[Frame]:
     """Random parts of the shipped frame of each weights, as NPY files."""
     frames = []
     for name in weights:
-        points, rng = load_frame(name).cloud.points, np.random.default_rng(0)
+        points = load_frame(name).cloud.points
+        rng = np.random.default_rng(0)
         for _ in range(count):
             kept = np.sort(rng.choice(len(points), int(len(points) * rng.uniform(0.6, 1.0)), replace=False))
             np.save(folder / "frame.npy", points[kept])
@@ -74,14 +75,18 @@ def one_after_the_other(
     """The frames with their answers, and seconds and processor seconds of each, in a process like the server's."""
     names = tuple(dict.fromkeys(frame.weights for frame in frames))
     setup = Setup(tuple(Served(name, name) for name in names), method, InferenceConfig(precision="float32"))
-    worker, answered, seconds = WorkerProcess(setup), list[Frame](), list[tuple[float, float]]()
+    worker = WorkerProcess(setup)
+    answered = list[Frame]()
+    seconds = list[tuple[float, float]]()
     worker.wait_until_ready()
     try:
         for frame in [*frames[:2], *frames]:  # the first ones load libraries
             (folder / "frame.npy").write_bytes(frame.content)
-            reading, isolation = InputConfig(), IsolationConfig()
+            reading = InputConfig()
+            isolation = IsolationConfig()
             request = FrameRequest(frame.weights, folder, "frame.npy", reading, isolation, resolution, JSON)
-            start, had = time.perf_counter(), processor_s(worker.process.pid)
+            start = time.perf_counter()
+            had = processor_s(worker.process.pid)
             reply = worker.ask(request)
             seconds.append((time.perf_counter() - start, processor_s(worker.process.pid) - had))
             assert reply.status == 200, reply.body
@@ -124,7 +129,8 @@ def client(
     port: int, frames: Sequence[Frame], seed: int, wanted: Callable[[], bool], address: str, tally: Tally
 ) -> None:
     """Ask for frames in a random order while it is wanted; refused ones are asked for again."""
-    rng, line = np.random.default_rng(seed), http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
+    rng = np.random.default_rng(seed)
+    line = http.client.HTTPConnection("127.0.0.1", port, timeout=PATIENCE_S)
     while wanted():
         frame = frames[int(rng.integers(len(frames)))]
         start = time.perf_counter()
@@ -201,7 +207,8 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         with served(*weights, *more, "--resolution", str(options.resolution), scratch=folder) as (process, port):
             address = "/v1/{weights}/reconstruct"
             load(port, answered, options.clients, 5.0, address, lambda _: None)  # libraries, caches
-            start, had = time.monotonic(), processor_s(process.pid)
+            start = time.monotonic()
+            had = processor_s(process.pid)
             seen = load(
                 port,
                 answered,

@@ -29,7 +29,8 @@ def main() -> None:
     options = parser.parse_args()
     scene = load_scene(options.scene)
     view = sample_view(scene.for_seed(options.seed), GenerateConfig(), example_rng(options.seed, 0))
-    camera, truth = view.depth.camera, truth_grid(view.mesh, CELLS)
+    camera = view.depth.camera
+    truth = truth_grid(view.mesh, CELLS)
     steps = np.rint(view.depth.depth / DEPTH_STEP)
     assert steps.max() <= np.iinfo(np.uint16).max, "the depth is too large for 16 bits"
     np.savez_compressed(

@@ -43,7 +43,8 @@ def accuracy(rest: SegmentedMesh, states: States, frames: int) -> None:
     print("segment       moved (rms)   estimate (rms, 99 %)   closest point (rms)   least Jacobian   undone   ms/state")
     rng = np.random.default_rng(0)
     for index, part in enumerate(rest.segments):
-        points, surface = interior(rest, index, rng), Surface(part.vertices, part.faces)
+        points = interior(rest, index, rng)
+        surface = Surface(part.vertices, part.faces)
         moved, errors, rivals, least, undone, seconds = [], [], [], [], [], 0.0
         for frame in np.linspace(0, states.end - 1, frames).astype(int):
             truth = states.frames.deformations(int(frame))[index]
@@ -69,7 +70,8 @@ def accuracy(rest: SegmentedMesh, states: States, frames: int) -> None:
 def speed(scenes: list[Scene], examples: int = 12) -> None:
     for scene in scenes:
         synthesize(scene, GenerateConfig(), example_rng(0, 0))
-        start, work = time.perf_counter(), time.process_time()
+        start = time.perf_counter()
+        work = time.process_time()
         for index in range(examples):
             synthesize(scene, GenerateConfig(), example_rng(1, index))
         wall, cpu = time.perf_counter() - start, time.process_time() - work

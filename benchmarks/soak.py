@@ -133,7 +133,8 @@ def page_opener(watched: Watched, held: int) -> Callable[[int], None]:
             break
     else:
         raise RuntimeError("mereo view has ended before it said its address")
-    address, pages = f"127.0.0.1:{found[1]}", deque[Any]()
+    address = f"127.0.0.1:{found[1]}"
+    pages = deque[Any]()
 
     def open_page(_: int) -> None:
         start = time.perf_counter()
@@ -151,7 +152,8 @@ def page_opener(watched: Watched, held: int) -> Callable[[int], None]:
 
 def soak(options: argparse.Namespace) -> list[Watched]:
     """Run both commands for the given time; rows are added at every interval."""
-    end, threads = threading.Event(), list[threading.Thread]()
+    end = threading.Event()
+    threads = list[threading.Thread]()
     with (
         tempfile.TemporaryDirectory() as folder,
         command(

@@ -38,10 +38,13 @@ def measure(scene: Scene, sensor: Sensor, seed: int, index: int) -> list[float]:
     start = time.process_time()
     found = readings(cloud)
     spent = time.process_time() - start
-    keep, side = surface_points(cloud.points), longest_side(cloud.points[genuine])
+    keep = surface_points(cloud.points)
+    side = longest_side(cloud.points[genuine])
     off = [abs(float(np.log(longest_side(reading.cloud.points) / side))) for reading in found]
     everything = abs(float(np.log(longest_side(cloud.points) / side)))
-    strays, left, lost = (~genuine).sum(), (keep & ~genuine).sum(), (~keep & genuine).mean()
+    strays = (~genuine).sum()
+    left = (keep & ~genuine).sum()
+    lost = (~keep & genuine).mean()
     return [strays, len(found) > 1, left, lost, everything, min(off), off[0], found[0].dropped > 0, 1e3 * spent]
 
 

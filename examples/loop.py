@@ -86,7 +86,8 @@ def smooth(value: float) -> float:
 
 def turn_at(time: float) -> float:
     """Where on the circle of states the object is: half a turn, a rest, half a turn; 1 is 0 again."""
-    first, second = min(time / STILL, 1.0), max((time - MOVE) / (SECONDS - MOVE), 0.0)
+    first = min(time / STILL, 1.0)
+    second = max((time - MOVE) / (SECONDS - MOVE), 0.0)
     return (REST - 0.5 * (1.0 - first) ** 2 + 0.5 * second**2) % 1.0
 
 
@@ -98,7 +99,8 @@ def mesh_at(scene: Scene, played: Played, turn: float) -> SegmentedMesh:
 
 def camera_pose() -> Float[np.ndarray, "4 4"]:
     """``T_world_camera``."""
-    across, up = np.cos(ELEVATION_RAD), np.sin(ELEVATION_RAD)
+    across = np.cos(ELEVATION_RAD)
+    up = np.sin(ELEVATION_RAD)
     away = np.array([across * np.sin(AZIMUTH_RAD), up, across * np.cos(AZIMUTH_RAD)])
     return look_at(MIDDLE + DISTANCE * away, MIDDLE, UP)
 
@@ -120,7 +122,8 @@ def moment(scene: Scene, played: Played, turn: float) -> Moment:
 def orbit(yaw_rad: float) -> Viewpoint:
     """An orthographic view of the camera frame, turned about the scene's vertical axis; 0 is the camera's own."""
     forward = transform_points(inverse_rigid(camera_pose()), np.stack([MIDDLE, MIDDLE + UP]))
-    axis, middle = forward[1] - forward[0], forward[0]
+    axis = forward[1] - forward[0]
+    middle = forward[0]
     eye = turn(np.zeros((1, 3)), middle, axis, np.array([yaw_rad]))[0]
     return Viewpoint(inverse_rigid(look_at(eye, middle, axis)), VIEW_UNITS / 2 * 1.02)
 
@@ -199,7 +202,9 @@ def names(mesh: SegmentedMesh) -> Image.Image:
     texts = [segment.name.replace("_", " ") for segment in mesh.segments]
     lengths = [24 + int(font(13).getlength(text)) for text in texts]
     plate = Image.new("RGB", (SIDE, FOOT), "white")
-    pen, x, y = ImageDraw.Draw(plate), (SIDE - sum(lengths)) // 2 + 4, FOOT // 2
+    pen = ImageDraw.Draw(plate)
+    x = (SIDE - sum(lengths)) // 2 + 4
+    y = FOOT // 2
     for segment, text, length in zip(mesh.segments, texts, lengths, strict=True):
         pen.ellipse((x, y - 5, x + 10, y + 5), fill=segment.color)
         pen.text((x + 14, y), text, fill=INK, font=font(13), anchor="lm")
@@ -248,7 +253,8 @@ class Loop:
         """The cloud, the segments that fill it, and in the end the cloud again."""
         if time <= FILL:
             return Image.fromarray(self.measured(time))
-        segments, back = Image.fromarray(self.registered(time)), ramp(time, SECONDS - FADE, FADE)
+        segments = Image.fromarray(self.registered(time))
+        back = ramp(time, SECONDS - FADE, FADE)
         return Image.blend(segments, Image.fromarray(self.measured(time)), back) if back > 0 else segments
 
     def frame(self, time: float) -> Image.Image:

@@ -66,8 +66,10 @@ def main() -> None:
         parser.error(str(error))
 
     view = sample_view(load_scene(options.scene), GenerateConfig(noise_std=0.0), example_rng(options.seed, 0))
-    solids, camera = Solids(view.mesh), view.depth.camera
-    near, far = view.depth.depth[view.depth.valid].min(), view.depth.depth.max()
+    solids = Solids(view.mesh)
+    camera = view.depth.camera
+    near = view.depth.depth[view.depth.valid].min()
+    far = view.depth.depth.max()
     pictures, captions = [], []
     for name, sensor in TERMS.items():
         seen = observe(solids, camera, 0.1, sensor, example_rng(options.seed, 1))

@@ -30,10 +30,14 @@ from mereo.scenes.registry import load_scene
 from mereo_objects import assets
 
 YOUNG_PA, POISSON, DENSITY, GRAVITY = 5000.0, 0.4, 1060.0, 9.81
-BACK, HELD_MM = np.array([0.05, 0.6, 0.8]), 40.0
+BACK = np.array([0.05, 0.6, 0.8])
+HELD_MM = 40.0
 """Nodes within 40 mm of the one farthest along this direction are held: the bare area."""
 
-TOOLS, DEPTH_MM, GRIP_MM, GRIP_NEWTON_PER_M = (1, 3), (10.0, 35.0), 15.0, 50.0
+TOOLS = (1, 3)
+DEPTH_MM = (10.0, 35.0)
+GRIP_MM = 15.0
+GRIP_NEWTON_PER_M = 50.0
 """How many, how far, how wide (standard deviation), and each node's spring at the centre of the grip."""
 
 GRAVITY_SHARE = 0.1
@@ -136,7 +140,8 @@ class SoftBody:
 
     def _grasp(self, rng: np.random.Generator) -> None:
         """Springs from the nodes around each tool to where it takes them; implicit, unlike applied forces."""
-        weight, target = np.zeros(len(self.mesh.nodes)), np.zeros_like(self.mesh.nodes)
+        weight = np.zeros(len(self.mesh.nodes))
+        target = np.zeros_like(self.mesh.nodes)
         for _ in range(rng.integers(TOOLS[0], TOOLS[1] + 1)):
             center = self.mesh.nodes[rng.choice(self.handles)]
             grip = np.exp(-0.5 * (np.linalg.norm(self.mesh.nodes - center, axis=1) / GRIP_MM) ** 2)

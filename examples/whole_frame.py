@@ -48,7 +48,8 @@ def simple(name: str, mesh: trimesh.Trimesh) -> SegmentedMesh:
 def desk() -> DepthImage:
     """A bent bunny among other things, metres."""
     scene = load_scene("bunny")
-    state, unit = scene.sample_state(example_rng(1000, 3)).mesh, scene.unit_m or 1.0
+    state = scene.sample_state(example_rng(1000, 3)).mesh
+    unit = scene.unit_m or 1.0
     bunny = state.with_vertices([unit * part.vertices for part in state.segments])
     upright = trimesh.creation.cylinder(0.035, 0.13)
     upright.apply_transform(rigid(Rotation.from_euler("x", 90, degrees=True).as_matrix(), np.zeros(3)))

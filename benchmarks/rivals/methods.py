@@ -143,7 +143,8 @@ def bayesian_cpd(frame: Frame, settings: Settings) -> Registered:
     finite = [step for step in steps if np.isfinite(step.transform(source)).all()]
     if not finite:
         return Registered(frame.posed, False)
-    points, last = frame.normalized(frame.posed), finite[-1]
+    points = frame.normalized(frame.posed)
+    last = finite[-1]
     motion = np.linalg.solve(multiquadric(source, source), np.broadcast_to(last.v, source.shape))
     moved = last.rigid_trans.transform(points + multiquadric(points, source) @ motion)
     return Registered(frame.restored(moved), finished and len(finite) == len(steps))

@@ -296,7 +296,8 @@ def parse(arguments: list[str]) -> Any:
 
     Raises ``ValueError`` for settings that are refused, such as a number out of its bounds.
     """
-    path, options = _option(arguments, "--config"), dict[str, Any]()
+    path = _option(arguments, "--config")
+    options = dict[str, Any]()
     if path is not None and arguments[0] in CONFIGURABLE:
         options = read_options(Path(path), arguments[0])
     recipe = _chosen(PRESETS, "base", _option(arguments, "--preset"), options.get("preset"))

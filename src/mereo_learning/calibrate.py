@@ -155,7 +155,8 @@ def ece_of(
     scaling: Scaling = Scaling(),  # noqa: B008 (frozen)
 ) -> float:
     """Expected calibration error of the scaled probability of the most likely class by the logits as they are."""
-    labels, rows = logits.argmax(axis=1), np.arange(len(logits))
+    labels = logits.argmax(axis=1)
+    rows = np.arange(len(logits))
     reliability = Reliability()
     reliability.add(softmax(scaled_array(scaling, logits).astype(np.float64), axis=1)[rows, labels], labels == truth)
     return reliability.ece

@@ -150,7 +150,8 @@ class RegistrationErrors:
         sure = registration.uncertainty
         if sure is None:
             raise ValueError("the registration was read from a file, which has no posterior: fit its frame again")
-        count, unit = len(truth), sure.optimum.unit / registration.scene_unit
+        count = len(truth)
+        unit = sure.optimum.unit / registration.scene_unit
         distances = np.linalg.norm(registration.material[:count] - truth, axis=1)
         off = distances / registration.scene_unit
         gaussian, other, reach = (
@@ -252,7 +253,8 @@ class Reliability:
     def of_view(cls, model: Trained, code: EncodedCloud, truth: TruthGrid) -> "Reliability":
         """Answers of a network about a view; one that tells no segments apart is scored for the whole."""
         points, labels = sample_cells(truth)
-        answer, result = model.query(code, points), cls()
+        answer = model.query(code, points)
+        result = cls()
         right = answer.label == np.minimum(labels, answer.probability.shape[1] - 1)
         result.add(answer.probability[np.arange(len(right)), answer.label].astype(np.float64), right)
         return result
@@ -272,7 +274,8 @@ class Reliability:
 
     def facts(self) -> list[dict[str, Any]]:
         """Bins that have answers: their share of all, mean confidence and share of right ones."""
-        total, filled = self.bins[0].sum(), self.bins[:, self.bins[0] > 0]
+        total = self.bins[0].sum()
+        filled = self.bins[:, self.bins[0] > 0]
         names = ("share", "confidence", "right")
         return [
             dict(zip(names, map(float, row), strict=True))
@@ -390,7 +393,8 @@ class Evaluation:
     miou_up_to_symmetry: float = float("nan")
 
     def __repr__(self) -> str:
-        scores, count = self.scores, counted(len(self.examples), "example")
+        scores = self.scores
+        count = counted(len(self.examples), "example")
         miou = "" if np.isnan(scores.miou) else f", mIoU {scores.miou:.3f}"
         return f"Evaluation({count}: IoU {scores.iou:.3f}{miou}; {listed(self.names)})"
 
@@ -491,17 +495,21 @@ class Scoring:
     def __call__(self, index: int) -> ScoredCase:
         """Score a case."""
         case, (model, registrar) = self.case(index), self.moved
-        names, grid, errors = segment_names(model)[0], case.truth.grid, None
+        names = segment_names(model)[0]
+        grid = case.truth.grid
+        errors = None
         try:
             answer = answer_frame(observe(case.cloud), model, registrar, scene_unit=case.scene_unit)
         except NoFit:  # it shows too little of the object
             answer = answer_frame(observe(case.cloud), model, None)
-        code, seconds = answer.encoded.code, answer.encoded.timings_s["encode"]
+        code = answer.encoded.code
+        seconds = answer.encoded.timings_s["encode"]
         assert code is not None
         started = time.perf_counter()
         labels = network_labels(model, code, grid)
         network = grid_confusion(case.truth, labels, len(names)), seconds + time.perf_counter() - started
-        confusion, registration = network[0], answer.registration
+        confusion = network[0]
+        registration = answer.registration
         if registration is not None:
             confusion = grid_confusion(case.truth, label_grid(registration.mesh, *grid.axes()), len(names))
             if case.material is not None and case.scene_unit is not None:
@@ -524,7 +532,8 @@ def _evaluated_view(
     case: TestCase, model: Trained, code: EncodedCloud, registration: Registration | None
 ) -> EvaluatedView:
     """Truth and answer on the truth's grid and ``PICTURE_MARGIN`` cells around it, which are empty in truth."""
-    grid, colors = case.truth.grid, segment_names(model)[1]
+    grid = case.truth.grid
+    colors = segment_names(model)[1]
     labels = np.pad(grid.labels, PICTURE_MARGIN)
     wide = replace(grid, labels=labels, origin=grid.origin - PICTURE_MARGIN * grid.spacing)
     if registration is None:

@@ -133,11 +133,14 @@ def augment_batch(batch: Batch, augment: AugmentConfig, draws: Draws) -> Batch:
 
     The optical axis passes through the viewpoint, so rolling about it is a rotation about z around the viewpoint.
     """
-    count, device = len(batch.cloud), batch.cloud.device
+    count = len(batch.cloud)
+    device = batch.cloud.device
     jitter = augment.jitter_std * draws.rand(count, 1) * draws.randn(*batch.cloud.shape[:2])
     angle = 2 * torch.pi * draws.rand(count) if augment.roll else torch.zeros(count)
-    cosine, sine = angle.cos().to(device), angle.sin().to(device)
-    zero, unit = torch.zeros_like(cosine), torch.ones_like(cosine)
+    cosine = angle.cos().to(device)
+    sine = angle.sin().to(device)
+    zero = torch.zeros_like(cosine)
+    unit = torch.ones_like(cosine)
     roll = torch.stack([cosine, -sine, zero, sine, cosine, zero, zero, zero, unit], dim=-1).view(count, 3, 3)
     origin = batch.viewpoint[:, None]
     # depth noise moves a point along its ray: p = v + (p - v) * (z + noise) / z
@@ -145,7 +148,8 @@ def augment_batch(batch: Batch, augment: AugmentConfig, draws: Draws) -> Batch:
     rays = rays * (1 + jitter.to(device) / rays[..., 2])[..., None]
     cloud = rays @ roll.transpose(1, 2)
     positions = (batch.positions - origin) @ roll.transpose(1, 2)
-    low, high = cloud.amin(dim=1), cloud.amax(dim=1)
+    low = cloud.amin(dim=1)
+    high = cloud.amax(dim=1)
     center, scale = (low + high) / 2, 2 / (high - low).amax(dim=1)
     return Batch(
         index=batch.index,
@@ -286,7 +290,8 @@ class Dataset:
         The random numbers come from ``draws``, so a batch depends on nothing else. ``observation`` says which one of
         each example is seen, 0 its own cloud; by default it is drawn.
         """
-        device, count = self.device, len(index)
+        device = self.device
+        count = len(index)
         stored = {name: values.to(device) for name, values in self.read(index).items()}
         total = stored["positions"].shape[1]
         rows, chosen = torch.arange(count, device=device)[:, None], torch.arange(total, device=device)[None]
@@ -326,10 +331,13 @@ def _observed_clouds(
     stored: Tensors, observation: Int[Tensor, " b"]
 ) -> tuple[Float[Tensor, "b p 3"], Int[Tensor, " b"]]:
     """Chosen cloud of each example, and how many of its points are real: the first ones."""
-    cloud, count = stored["cloud"], stored["cloud_count"].long()
+    cloud = stored["cloud"]
+    count = stored["cloud_count"].long()
     if "seen" not in stored:
         return cloud, count
-    rows, further, number = torch.arange(len(cloud)), observation > 0, (observation - 1).clamp(min=0)
+    rows = torch.arange(len(cloud))
+    further = observation > 0
+    number = (observation - 1).clamp(min=0)
     cloud = torch.where(further[:, None, None], stored["seen"][rows, number].float(), cloud)
     return cloud, torch.where(further, stored["seen_count"][rows, number].long(), count)
 

@@ -136,7 +136,8 @@ def _offset_scale(width: int) -> Picture:
 def _error_row(case: EvaluatedView, size: int) -> list[Picture]:
     direction, up = CAMERA
     front, behind = (Viewpoint.along(_bounds(case), tuple(sign * np.asarray(direction)), up) for sign in (1, -1))
-    segments, offset = np.asarray(case.colors, dtype=float).reshape(-1, 3), offset_triangles(case)
+    segments = np.asarray(case.colors, dtype=float).reshape(-1, 3)
+    offset = offset_triangles(case)
     shown = (
         (_labelled(case, (case.predicted > 0).astype(np.uint8), [PLAIN]), front),
         (offset, front),

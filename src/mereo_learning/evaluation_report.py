@@ -67,7 +67,8 @@ def evaluate_weights(
                 "device": workers.device if isinstance(workers, Cluster) else model.device.type,
                 "precision": model.working_precision,
             }
-        values, picture = metrics(evaluation, {**facts, "trained": model.provenance}), directory / "errors.png"
+        values = metrics(evaluation, {**facts, "trained": model.provenance})
+        picture = directory / "errors.png"
         if options is not None:
             write_json(directory / CONFIG, options)
         write_json(directory / "metrics.json", values)
@@ -125,7 +126,8 @@ def write_evaluation_report(
         colors: colours of the segments.
         picture: a PNG file, which the page has as a JPEG, made smaller until it fits into ``BUDGET_BYTES``.
     """
-    names, mean = tuple(metrics["per_segment"]), metrics["example_mean"]
+    names = tuple(metrics["per_segment"])
+    mean = metrics["example_mean"]
     title = " on ".join(str(metrics[key]) for key in ("weights", "scene") if key in metrics) or "mereo evaluation"
     below = {"iou", "miou", "definition", "ece", "calibrated"}
     facts = {k: v for k, v in metrics.items() if isinstance(v, str | int | float) and k not in below}
@@ -149,7 +151,8 @@ def write_evaluation_report(
         )
     )
     words = escape(str(metrics.get("definition", "")))
-    room, encoded = BUDGET_BYTES - len(text.encode()) - len(STYLE) - len(words) - 2000, io.BytesIO()
+    room = BUDGET_BYTES - len(text.encode()) - len(STYLE) - len(words) - 2000
+    encoded = io.BytesIO()
     with Image.open(picture) as image:
         small = image.convert("RGB")
     small.save(encoded, "JPEG", quality=85)

@@ -50,7 +50,8 @@ def diagonal(mesh: SegmentedMesh) -> float:
 
 def exposed(rest: SegmentedMesh) -> SegmentedMesh:
     """Faces that can be seen from outside: not inside another segment and not within ``CONTACT`` of one."""
-    solids, reach = Solids(rest), CONTACT * diagonal(rest)
+    solids = Solids(rest)
+    reach = CONTACT * diagonal(rest)
     inner = {index for index, _ in rest.nesting}
     shown = []
     for index, segment in enumerate(rest.segments):
@@ -99,7 +100,8 @@ def sample_surface(
     count = int(np.clip(areas.sum() / area, least, most))
     vertices, faces, _ = mesh.merged()
     corners = vertices[faces[rng.choice(len(faces), size=count, p=areas / areas.sum())]]
-    along, across = np.sqrt(rng.random((count, 1))), rng.random((count, 1))
+    along = np.sqrt(rng.random((count, 1)))
+    across = rng.random((count, 1))
     a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
     places = a * (1 - along) + b * along * (1 - across) + c * along * across
     first = unit_rows(b - a)
@@ -291,7 +293,8 @@ def icp(
         rotation_epsilon=1e-6,
         translation_epsilon=1e-6,
     )
-    points_to_surface, held = result.T_target_source, 0
+    points_to_surface = result.T_target_source
+    held = 0
     if hold:
         curvature = 2 * FLATNESS * result.H / max(result.num_inliers, 1)
         points_to_surface, held = constrained(points_to_surface, curvature)

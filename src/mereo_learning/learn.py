@@ -241,7 +241,9 @@ def learn(
 
     Raises ``ValueError`` for other settings than the folder was begun with, and as the stages do.
     """
-    clock, units, train = Clock(60 * config.minutes), config.units, config.train
+    clock = Clock(60 * config.minutes)
+    units = config.units
+    train = config.train
     if config.init:
         find_weights(config.init)  # a name that is none is better said before the work
     elif train != "never" and not shipped_names():
@@ -258,7 +260,8 @@ def learn(
             "--output"
         )
     scene = scene_for(files, output, units)
-    loaded, named = load_scene(scene), place_of_scene(Path(scene))
+    loaded = load_scene(scene)
+    named = place_of_scene(Path(scene))
     clock.stage(2, "score the search alone, without training")
     searched = search_scores(output, loaded, named, SEARCH_SHARE * clock.budget_s)
     reasons = shortcomings(searched.summary())
@@ -318,7 +321,8 @@ def recipe_for(minutes: float) -> TrainConfig:
 def _claim(output: Path, settings: dict[str, Any]) -> None:
     """Take the folder, or check that it was begun with the same arguments: they bind once something is made of them."""
     before = claim(output, CONFIG, settings, "what is learnt")
-    planned, written = (output / PLAN).is_file(), (output / SCENE).is_file()
+    planned = (output / PLAN).is_file()
+    written = (output / SCENE).is_file()
     for name, value in settings.items():
         binds = planned or (written and name in ("object", "units"))
         if before is not None and binds and before.get(name) != value:

@@ -126,7 +126,8 @@ def _object(model: Model) -> dict[str, Any]:
 
 
 def _training(made: Mapping[str, Any]) -> dict[str, Any]:
-    recipe, data = made.get("recipe") or {}, made.get("data")
+    recipe = made.get("recipe") or {}
+    data = made.get("data")
     seen = describe_seen(made)
     return {
         "data": f"{made.get('training_examples', 'unknown')} examples of seed {made.get('training_seed')}",
@@ -155,7 +156,8 @@ def _result(test: Mapping[str, Any]) -> str:
 
 def _camera(test: Mapping[str, Any]) -> str:
     """Words for the camera of synthetic views: what differs from the paper's, and the noise."""
-    sensor, size = SensorConfig(**(test.get("sensor") or {})), test.get("image_size", GenerateConfig.image_size)
+    sensor = SensorConfig(**(test.get("sensor") or {}))
+    size = test.get("image_size", GenerateConfig.image_size)
     named = [name.replace("-", " ") for name, known in SENSORS.items() if known == replace(sensor, tool=known.tool)]
     words = {
         named[0] if named else "a camera of its own terms": sensor.on,

@@ -137,7 +137,8 @@ def place(
     size = scale_of(start.poses[0]) * diagonal(rest)
     # a scanner does not say where it stood: far off along z
     viewpoint = np.zeros(3) if frame == "camera" else points.mean(axis=0) + np.array([0.0, 0.0, 1000.0 * size])
-    scan, shown = Scan.of(points, viewpoint, size), exposed(rest)
+    scan = Scan.of(points, viewpoint, size)
+    shown = exposed(rest)
     held = np.isin(rest.names, list(hold))
     together = [int(index) for index in np.flatnonzero(~start.separate)]
     alone = [[int(index)] for index in np.flatnonzero(start.separate & ~held)]
@@ -149,7 +150,8 @@ def place(
     each = register(shown, scan, whole.poses, others, SEGMENT_LIMITS, hold=True)
     _check(rest, np.where(start.separate[:, None, None], start.poses, whole.poses), each, scan)
     # segments that are not seen get their start or their neighbour's pose
-    poses, placed_by = each.poses.copy(), ["scan"] * len(each.poses)
+    poses = each.poses.copy()
+    placed_by = ["scan"] * len(each.poses)
     counts = np.bincount(each.matches.owner[each.matches.owner >= 0], minlength=len(poses))
     for index in np.flatnonzero(~each.fitted):
         if start.separate[index]:
@@ -190,7 +192,8 @@ def _shift(before: Transform, after: Transform, point: Vector) -> float:
 
 def neighbour(rest: SegmentedMesh, index: int, seen: Bool[np.ndarray, " s"], counts: Int[np.ndarray, " s"]) -> int:
     """Index of the seen segment nearest to another one at rest; of several in contact that with the most points."""
-    solids, vertices = Solids(rest), rest.segments[index].vertices
+    solids = Solids(rest)
+    vertices = rest.segments[index].vertices
     gaps = {int(other): float(solids.segment_distance(int(other), vertices).min()) for other in np.flatnonzero(seen)}
     reach = min(gaps.values()) + CONTACT * diagonal(rest)
     return max((other for other, gap in gaps.items() if gap <= reach), key=lambda other: int(counts[other]))

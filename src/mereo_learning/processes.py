@@ -151,7 +151,8 @@ class SharedBatchNorm(nn.BatchNorm1d):
         if not self.training:
             return super().forward(rows)
         assert self.momentum is not None and self.running_mean is not None and self.running_var is not None
-        exact, world = rows.float(), dist.get_world_size()
+        exact = rows.float()
+        world = dist.get_world_size()
         mean = _Sum.apply(exact.mean(dim=0)) / world
         # by distances from the mean, not by squares: a mean may be hundreds of spreads
         variance = _Sum.apply((exact - mean).square().mean(dim=0)) / world

@@ -131,7 +131,8 @@ COUNTS = ("points", "neighbors", "ratio1", "ratio2", "local_neighbors", "sight_n
 
 def _check_architecture(start: NetworkConfig, config: TrainConfig) -> None:
     """Raise ``ValueError`` where weights differ in more than an added template lookup and counts that both have."""
-    given, ours = start.to_dict(), config.network.to_dict()
+    given = start.to_dict()
+    ours = config.network.to_dict()
     free = {name for name in COUNTS if given[name] and ours[name]}
     if ours["rest_template"]:
         free.add("rest_template")
@@ -216,7 +217,9 @@ def seen_in_training(provenance: Mapping[str, Any]) -> tuple[int | None, int | N
 
     None where the weights do not say, as those of an older mereo.
     """
-    recipe, steps, before = provenance.get("recipe") or {}, provenance.get("steps"), provenance.get("examples_before")
+    recipe = provenance.get("recipe") or {}
+    steps = provenance.get("steps")
+    before = provenance.get("examples_before")
     if not isinstance(before, int):
         facts = (str(provenance.get(name)) for name in ("scene", "training_seed", "steps"))
         before = 0 if recipe and not recipe.get("init") else _BEFORE.get(tuple(facts))

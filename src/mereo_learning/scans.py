@@ -212,7 +212,8 @@ def read_truth(path: str | Path, scene: Scene | None = None) -> PosedScan:
             raise ValueError(f"the name of its scan is {facts['scan']!r:.40}")
         if scan.unit not in UNITS_M or scan.frame not in get_args(CloudAxes):
             raise ValueError(f"its unit is {scan.unit!r:.40} and its frame {scan.frame!r:.40}, which are unknown")
-        name, scan_sha256 = str(facts["scene"]), facts["scan_sha256"]
+        name = str(facts["scene"])
+        scan_sha256 = facts["scan_sha256"]
     loaded = scene_named_in(path, name) if scene is None else scene
     rest, unit_m = loaded.rest, loaded.unit_m
     # not the same bytes: other versions of the libraries cut the same solid into other triangles

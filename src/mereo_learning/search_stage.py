@@ -91,7 +91,8 @@ def score_search(
     """
     registrar = Registrar(None, kept_model(scene), given=scene)
     registrar.prepare()  # no part of a frame's seconds
-    started, scored = time.monotonic(), [] if begun is None else list(begun.views)
+    started = time.monotonic()
+    scored = [] if begun is None else list(begun.views)
     with progress("score the search", views - len(scored), "views") as shown:
         while len(scored) < views and (len(scored) < least or time.monotonic() - started < budget_s):
             scored.append(_scored(scene, registrar, cells, len(scored)))
@@ -103,7 +104,8 @@ def _scored(scene: Scene, registrar: Registrar, cells: int, index: int) -> dict[
     """Scores of a view, as ``SearchScores.views`` has them; one in which nothing is found scores 0."""
     case = scene_case(scene, GenerateConfig(), TEST_SEED_START, cells, index)
     started = time.perf_counter()
-    labels, explained = np.zeros_like(case.truth.grid.labels), False
+    labels = np.zeros_like(case.truth.grid.labels)
+    explained = False
     try:
         answer = answer_frame(observe(case.cloud), None, registrar, scene_unit=case.scene_unit)
         seconds = answer.seconds
@@ -212,7 +214,8 @@ LOWEST = 0.5
 
 def shortcomings(search: Mapping[str, Any]) -> list[str]:
     """Reasons why the search alone is not good enough, by its ``SearchScores.summary``; none where it is."""
-    views, missed = search["examples"], round((1 - search["explained"]) * search["examples"])
+    views = search["examples"]
+    missed = round((1 - search["explained"]) * search["examples"])
     reasons = []
     if missed:
         reasons.append(f"{missed} of {views} views are not explained")

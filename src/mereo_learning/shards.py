@@ -184,7 +184,8 @@ def check_dataset(folder: Place) -> None:
     none, and ``StorageError`` where the storage refuses.
     """
     manifest = read_manifest(folder)
-    problems, files = dict[str, str](), expected_files(manifest)
+    problems = dict[str, str]()
+    files = expected_files(manifest)
     with progress("check", len(files), "files") as shown:
         for name in files:
             try:
@@ -324,7 +325,8 @@ def generate(
     if isinstance(output, Path):  # an object storage tells no free space
         stored = sum(file.stat().st_size for file in output.glob("shard-*.safetensors"))
         disk = next(folder for folder in output.absolute().parents if folder.is_dir())
-        needed, free = manifest["bytes"] // shard[1] - stored, shutil.disk_usage(disk).free
+        needed = manifest["bytes"] // shard[1] - stored
+        free = shutil.disk_usage(disk).free
         if needed > free:
             raise ValueError(
                 f"--examples {examples} needs {needed / 1e9:,.1f} GB and {output} has {free / 1e9:,.1f} GB free: ask "
@@ -392,7 +394,9 @@ def make_manifest(scene: Scene, settings: GenerateConfig, examples: int, seed: i
 
 def example_bytes(settings: GenerateConfig, segments: int) -> int:
     """Size of one example in bytes, on disk and in memory."""
-    per_point, per_query, once = 12, 12 + 1 + 4 + 6 + 6, 4 + 24 + 8
+    per_point = 12
+    per_query = 12 + 1 + 4 + 6 + 6
+    once = 4 + 24 + 8
     seen = len(settings.further) * (6 * settings.points + 4)
     return per_point * settings.points + per_query * settings.sampling.total(segments) + once + seen
 
@@ -430,7 +434,9 @@ def _make_shard(scene: str | Scene, settings: GenerateConfig, seed: int, dataset
 
 def pack(example: Example, points: int) -> dict[str, np.ndarray]:
     """Row of each tensor of a shard for one example; clouds with fewer points repeat theirs from the front."""
-    count, queries, seen = len(example.cloud), example.queries, dict[str, np.ndarray]()
+    count = len(example.cloud)
+    queries = example.queries
+    seen = dict[str, np.ndarray]()
     if example.observations:  # half precision is off by 0.0003 where a pixel is 0.03 wide
         clouds = np.stack([_filled(cloud, points) for cloud in example.observations]).astype(np.float16)
         counts = np.array([len(cloud) for cloud in example.observations], dtype=np.int32)

@@ -78,7 +78,9 @@ def _answer(answer: AnswerScores, segmented: bool) -> dict[str, float]:
 
 def certainty_lines(metrics: Mapping[str, Any]) -> list[str]:
     """Sentences on ``coverage95`` and ``known`` of ``metrics``, where these are not None."""
-    lines, radii, known = [], metrics.get("coverage95"), metrics.get("known")
+    lines = []
+    radii = metrics.get("coverage95")
+    known = metrics.get("known")
     if radii is not None:
         shares = ", ".join(f"{name} {radii[name]:.1%}" for name in ("seen", "hidden") if radii[name] is not None)
         medians = [

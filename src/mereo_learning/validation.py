@@ -45,7 +45,8 @@ def validate(network: Network, data: Dataset, config: TrainConfig, further: bool
 @torch.no_grad()
 def choose_offsets(network: Network, data: Dataset, config: TrainConfig) -> Float[Tensor, " c"] | None:
     """Class offsets (``logit_adjustment``) from the first training examples; None when off."""
-    count, uniform = min(config.offset_examples, len(data) - config.holdout), data.uniform_queries
+    count = min(config.offset_examples, len(data) - config.holdout)
+    uniform = data.uniform_queries
     if not (count and uniform and config.supervision.labels):
         return None
     answers = _answers(network, data, config, range(count))

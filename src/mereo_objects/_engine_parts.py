@@ -34,7 +34,8 @@ CAM_HALF_ANGLE = float(np.deg2rad(75.0))
 TAPPET_TOP = CAM_HEIGHT - CAM_BASE_RADIUS - 0.12
 """Of a closed valve: 0.12 of play under the base circle."""
 
-INTAKE_AT, INTAKE_RADIUS = -2.05, 1.7
+INTAKE_AT = -2.05
+INTAKE_RADIUS = 1.7
 EXHAUST_AT, EXHAUST_RADIUS = 2.25, 1.5
 """Place along x from the cylinder's axis, and radius of the valve's head."""
 
@@ -143,7 +144,9 @@ def connecting_rod(number: int) -> Manifold:
 
 def piston(number: int) -> Manifold:
     """Crown with three ring grooves and valve pockets, slipper skirt, hollow inside, with its pin."""
-    r, top, bottom = PISTON_RADIUS, CROWN, -2.0
+    r = PISTON_RADIUS
+    top = CROWN
+    bottom = -2.0
     profile = [(bottom, r - 0.05)]
     for groove in (-1.9, -1.2, -0.5):
         height = top + groove

@@ -113,7 +113,8 @@ def follow(
     before: Float[np.ndarray, "4 4"], knuckle: Knuckle, rotation_vector: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
     """Motion of a knob's link from rest, given that of its socket's."""
-    rotation, pivot = Rotation.from_rotvec(rotation_vector).as_matrix(), np.array(knuckle.pivot)
+    rotation = Rotation.from_rotvec(rotation_vector).as_matrix()
+    pivot = np.array(knuckle.pivot)
     motion = np.eye(4)
     motion[:3, :3], motion[:3, 3] = rotation, pivot - rotation @ pivot
     return before @ motion

@@ -34,7 +34,8 @@ LONGEST_EDGE = 3.6
 MOUTH = ((-0.37, 6.23, 0.5), (0.37, 7.0, 1.44))
 """Box that holds the mouth's inner surface, and no skin but some under the chin."""
 
-EYE, EYE_RADIUS = (0.308, 7.284, 1.245), 0.146
+EYE = (0.308, 7.284, 1.245)
+EYE_RADIUS = 0.146
 """The left eyeball, which is not in the group `body` (centre and size of MakeHuman's `helper-l-eye`)."""
 
 

@@ -69,7 +69,8 @@ def share_field() -> ShareField:
     """Share field of the body at rest."""
     rest = rest_mesh()
     low, high = rest.bounds
-    first, last = np.floor(low / SPACING - SHELL), np.ceil(high / SPACING + SHELL)
+    first = np.floor(low / SPACING - SHELL)
+    last = np.ceil(high / SPACING + SHELL)
     # whole multiples of the spacing, so that left and right are treated alike
     axes = [SPACING * np.arange(a, b + 1) for a, b in zip(first, last, strict=True)]
     inside = label_grid(rest, *axes) > 0
@@ -110,7 +111,8 @@ def _flow(number: Int[np.ndarray, "x y z"]) -> csr_matrix:
     """Laplacian of the graph of neighbouring nodes that have a number."""
     pairs = []
     for axis in range(3):
-        first, second = np.moveaxis(number, axis, 0)[:-1].ravel(), np.moveaxis(number, axis, 0)[1:].ravel()
+        first = np.moveaxis(number, axis, 0)[:-1].ravel()
+        second = np.moveaxis(number, axis, 0)[1:].ravel()
         inside = (first >= 0) & (second >= 0)
         pairs.append(np.stack([first[inside], second[inside]]))
     i, j = np.concatenate(pairs, axis=1)
@@ -134,7 +136,8 @@ def _diffused(shares: Float[np.ndarray, "r j"], number: Int[np.ndarray, "x y z"]
 
 def _extended(shares: Float[np.ndarray, "r j"], number: Int[np.ndarray, "x y z"]) -> Float[np.ndarray, "n j"]:
     """Harmonic in the shell: steady heat between the body's nodes, which keep theirs, and an insulated outside."""
-    size, flow = len(shares), _flow(number)
+    size = len(shares)
+    flow = _flow(number)
     shell = splu(flow[size:, size:].tocsc()).solve(-(flow[size:, :size] @ shares))
     return np.concatenate([shares, shell])
 
@@ -161,13 +164,15 @@ class PosedBody:
         known = _kept_shares(np.asarray(points, dtype=np.float64).tobytes()) if len(points) <= KEPT else _shares(points)
         shares, turned = known
         moved = self._shaped(points, shares)
-        heads, angles = self.heads(), np.linalg.norm(self.rotations, axis=1)
+        heads = self.heads()
+        angles = np.linalg.norm(self.rotations, axis=1)
         # Rodrigues' formula for a fixed axis is two products with these and their squares
         quarter = crossing(self.rotations / np.maximum(angles, 1e-12)[:, None])
         half = quarter @ quarter
         for index in reversed(range(len(JOINTS))):
             rows = turned[index]
-            local, angle = moved[rows] - heads[index], (angles[index] * shares[rows, index])[:, None]
+            local = moved[rows] - heads[index]
+            angle = (angles[index] * shares[rows, index])[:, None]
             moved[rows] += np.sin(angle) * (local @ quarter[index]) + (1.0 - np.cos(angle)) * (local @ half[index])
         return moved
 

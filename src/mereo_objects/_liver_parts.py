@@ -107,7 +107,8 @@ INSTRUMENTS = {"grasper": ("edge", GRASPER), "retractor": ("gallbladder", RETRAC
 """Where each may be, and what it does there."""
 
 BEND_RAD, TWIST_RAD, SQUASH = 0.5, 0.6, 0.12
-LATTICE_CELLS, LATTICE_STRENGTH = (3, 3, 3), 0.4
+LATTICE_CELLS = (3, 3, 3)
+LATTICE_STRENGTH = 0.4
 
 EDGE_SHARE = 0.12
 """A grasper holds the liver by the sharpest part of its vertices."""

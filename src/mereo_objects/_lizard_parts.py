@@ -87,15 +87,18 @@ class Leg:
 @cache
 def leg(plan: LegPlan, side: int) -> Leg:
     """Leg of a plan, ``side`` +1 for left and -1 for right."""
-    x, y = NOSE - plan.root[0], plan.root[1]
+    x = NOSE - plan.root[0]
+    y = plan.root[1]
     root, knee, ankle = (x, y), (x + plan.knee[0], y + plan.knee[1]), (x + plan.ankle[0], y + plan.ankle[1])
     shank_rad = float(np.arctan2(ankle[1] - knee[1], ankle[0] - knee[0]))
     outward_rad = 0.5 * (np.pi / 2 + float(np.arctan2(plan.knee[1], plan.knee[0])))
     at_root = Knuckle((*root, 1.5), side * outward_rad, 1.3, 0.95, 0.5)
     at_ankle = Knuckle((*ankle, 1.0), side * (shank_rad + plan.foot_rad) / 2, 0.7, 0.95, 0.42, 0.16)
-    limb, foot = _limb(plan, root, knee, ankle), _foot(plan, ankle)
+    limb = _limb(plan, root, knee, ankle)
+    foot = _foot(plan, ankle)
     if side < 0:
-        limb, foot = limb.mirror((0.0, 1.0, 0.0)), foot.mirror((0.0, 1.0, 0.0))
+        limb = limb.mirror((0.0, 1.0, 0.0))
+        foot = foot.mirror((0.0, 1.0, 0.0))
         at_root, at_ankle = (
             Knuckle(
                 (k.pivot[0], -k.pivot[1], k.pivot[2]), k.heading_rad, k.radius, k.sector_rad, k.opening_rad, k.clearance
@@ -155,7 +158,8 @@ def _spike(base: Vector, radius: float, tip: Vector, stretch: float = 1.6) -> Ma
 
 def _section(station: float) -> Float[np.ndarray, "s 3"]:
     """The body's outline at a station: broad, rounded above, flat below."""
-    width, top = half_width(station), height(station)
+    width = half_width(station)
+    top = height(station)
     middle = 0.4 * top
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     y = width * np.sign(np.cos(angle)) * np.abs(np.cos(angle)) ** 0.85
@@ -168,8 +172,10 @@ def _trunk_and_tail() -> Manifold:
     stations = np.concatenate([np.arange(7.0, 40.0, 2.75), np.arange(40.0, 72.0, 4.0), [72.0]])
     rings = [_section(float(station)) for station in stations]
     vertices = np.concatenate([*rings, [rings[0].mean(axis=0)], [rings[-1].mean(axis=0)]])
-    i, j = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
-    faces, last = [], SIDES * (len(rings) - 1)
+    i = np.arange(SIDES)
+    j = (np.arange(SIDES) + 1) % SIDES
+    faces = []
+    last = SIDES * (len(rings) - 1)
     for a in range(0, last, SIDES):
         b = a + SIDES
         faces += [np.stack([a + i, a + j, b + j], axis=1), np.stack([a + i, b + j, b + i], axis=1)]
@@ -183,7 +189,9 @@ def _scales() -> list[Manifold]:
     """A crest along the back, two rows of keeled scales on each side of it, and a fringe of spikes on the flanks."""
     parts = []
     for station in [*np.arange(11.0, 40.0, 2.25), *np.arange(41.1, 70.0, 2.0)]:
-        x, width, top = NOSE - station, half_width(station), height(station)
+        x = NOSE - station
+        width = half_width(station)
+        top = height(station)
         size = width / 5.0
         rows = (0.36, 0.7) if station < 40.0 else (0.5,)
         parts.append(_spike((x, 0.0, top - 0.15), 0.35 + 0.4 * size, (-0.6, 0.0, 0.6 + 1.0 * size)))

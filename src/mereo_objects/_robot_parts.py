@@ -159,7 +159,8 @@ def wrist() -> Manifold:
 
 def hand() -> Manifold:
     """Bolted flange, adapter, gripper housing with cooling slots, guide rails, a socket on top and a camera beside."""
-    x, z = WRIST[0] + 3.6 + GAP, FOREARM_HEIGHT
+    x = WRIST[0] + 3.6 + GAP
+    z = FOREARM_HEIGHT
     flange = union(
         shaft("x", (x, 0, z), 0.8, 2.4, sides=24),
         shaft("x", (x + 0.5, 0, z), 1.5, 1.7, sides=20),
@@ -185,7 +186,8 @@ def hand_camera() -> Manifold:
     It is what tells the fingers apart, so it stands out far enough for a depth image of 96 x 96 pixels, in which one
     pixel is about a unit. It is far enough forward to pass the forearm where the wrist is pitched all the way.
     """
-    x, z = WRIST[0] + 3.6 + GAP, FOREARM_HEIGHT
+    x = WRIST[0] + 3.6 + GAP
+    z = FOREARM_HEIGHT
     y = -7.9
     bracket = box((x + 2.8, y + 1.0, z - 1.0), (x + 4.8, -3.5, z + 1.0), 0.2)
     body = box((x + 3.0, y - 1.6, z - 2.8), (x + 6.2, y + 1.6, z + 2.8), 0.4)
@@ -198,7 +200,9 @@ def hand_camera() -> Manifold:
 
 def finger(side: int) -> Manifold:
     """A jaw on its carriage; ``side`` is +1 for +y and -1 for -y. The gripping face is notched for round bars."""
-    x, z, inner = WRIST[0] + 3.6 + GAP + 5.6 + 0.15, FOREARM_HEIGHT, JAW_OPENING
+    x = WRIST[0] + 3.6 + GAP + 5.6 + 0.15
+    z = FOREARM_HEIGHT
+    inner = JAW_OPENING
     carriage = box((x, inner, z - 1.9), (x + 1.8, inner + 2.4, z + 1.9), 0.2)
     tip, back = x + 6.6, inner + 2.0
     blade = plate(

@@ -31,7 +31,8 @@ LARGEST_OFFSET = THICKNESS / 2 + max(HEM_RISE, STUD_RISE)
 SPACING = 1.9
 """Of the plan's points, where no detail asks for more."""
 
-TAB_LENGTH, TAB_ROWS = 7.0, (4.0, 12.6)
+TAB_LENGTH = 7.0
+TAB_ROWS = (4.0, 12.6)
 """How far the tab reaches out of the sheet's +x edge, and the range of y whose rows of points it takes up."""
 
 DETAIL_RADIUS = 1.4
@@ -108,7 +109,8 @@ def _grid() -> Float[np.ndarray, "n 2"]:
 
 def _plan_points() -> Float[np.ndarray, "n 2"]:
     """The grid with rings set into it."""
-    grid, holes = _grid(), _hole_centers()
+    grid = _grid()
+    holes = _hole_centers()
     clear = cKDTree(STUDS).query(grid)[0] > 1.3 * DETAIL_RADIUS + 0.3
     kept = clear & (cKDTree(holes).query(grid)[0] > DETAIL_RADIUS + 0.4)
     studs = [_ring(center, share * DETAIL_RADIUS) for center in STUDS for share in (STUD_TOP, 1.0, 1.3)]
@@ -125,7 +127,8 @@ def _rounded(plan: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Squares at the corners of sheet and tab become quarter discs; nothing else moves."""
     root, size = _tab_box()
     on_tab = (plan[:, 0] > HALF[0])[:, None]
-    local, half = plan - np.where(on_tab, root, 0.0), np.where(on_tab, size, HALF)
+    local = plan - np.where(on_tab, root, 0.0)
+    half = np.where(on_tab, size, HALF)
     radius = np.minimum(CORNER, half.min(axis=1, keepdims=True))
     beyond = np.maximum(np.abs(local) - (half - radius), 0.0) / radius
     drawn = beyond * np.sqrt(1.0 - beyond[:, ::-1] ** 2 / 2)
@@ -135,7 +138,8 @@ def _rounded(plan: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
 def _is_solid(corners: Float[np.ndarray, "f 3 2"]) -> Bool[np.ndarray, " f"]:
     """Whether triangles belong to the plan: not in a hole, nor beside the tab."""
     in_hole = cKDTree(_hole_centers()).query(corners.mean(axis=1))[0] < 0.9 * DETAIL_RADIUS
-    x, y = corners[..., 0].max(axis=1), corners[..., 1]
+    x = corners[..., 0].max(axis=1)
+    y = corners[..., 1]
     low, high = _tab_rows()[[0, -1]]
     return ~in_hole & ((x <= HALF[0]) | ((y >= low) & (y <= high)).all(axis=1))
 

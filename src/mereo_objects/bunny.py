@@ -55,7 +55,8 @@ TAIL = Cut((9.2, -9.3, 2.0), (0.945, -0.325, 0.0), half=5.0, length=9.0)
 def model_to_scene() -> tuple[Float[np.ndarray, "3"], float]:
     """Centre and scale of ``scene = (model - center) * scale``, which takes the metres of bunny.off to scene units."""
     vertices = _load().vertices
-    low, high = vertices.min(axis=0), vertices.max(axis=0)
+    low = vertices.min(axis=0)
+    high = vertices.max(axis=0)
     return read_only((low + high) / 2), float(SHORTEST_SIDE / (high - low).min())
 
 

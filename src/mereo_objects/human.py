@@ -87,10 +87,12 @@ def balls() -> Balls:
         if depth[row] < SMALLEST_BALL:
             break
         if not (np.linalg.norm(centers - nodes[row], axis=1) < radii + 0.4).any():
-            centers, radii = np.concatenate([centers, nodes[row : row + 1]]), np.append(radii, depth[row])
+            centers = np.concatenate([centers, nodes[row : row + 1]])
+            radii = np.append(radii, depth[row])
     for vertex in np.concatenate([segment.vertices for segment in rest.segments]):
         if (np.linalg.norm(centers - vertex, axis=1) - radii).min() > BARE:
-            centers, radii = np.concatenate([centers, vertex[None]]), np.append(radii, 0.0)
+            centers = np.concatenate([centers, vertex[None]])
+            radii = np.append(radii, 0.0)
     touching = radii[:, None] + radii
     apart = np.where(cdist(centers, centers) - touching > APART, touching + LEAST_GAP, -1.0)
     return Balls(read_only(centers), read_only(apart))
@@ -112,7 +114,8 @@ def keeps_space(posed: Deformation) -> bool:
 def critical_points() -> Float[np.ndarray, "n 3"]:
     """Vertices at which the joints can press space most: largest angle, slope of the share and lever multiply."""
     vertices = np.concatenate([segment.vertices for segment in rest_mesh().segments])
-    field, step = share_field(), 0.05 * np.eye(3)
+    field = share_field()
+    step = 0.05 * np.eye(3)
     slope = np.stack([field(vertices + along) - field(vertices - along) for along in step], axis=2) / 0.1
     lever = np.linalg.norm(vertices[:, None] - part_axes()[1], axis=2)
     largest = np.abs(turn_limits()).max(axis=(0, 2))

@@ -54,8 +54,10 @@ def _disc(x: float) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     circle = np.stack([np.zeros(SIDES), np.cos(angle), np.sin(angle)], axis=1)
     vertices = np.concatenate([np.zeros((1, 3)), 0.5 * RADIUS * circle, RADIUS * circle]) + np.array([x, 0.0, 0.0])
-    i, j = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
-    inner, outer = 1, 1 + SIDES
+    i = np.arange(SIDES)
+    j = (np.arange(SIDES) + 1) % SIDES
+    inner = 1
+    outer = 1 + SIDES
     faces = np.concatenate(
         [
             np.stack([np.zeros(SIDES, dtype=int), inner + i, inner + j], axis=1),
@@ -79,9 +81,11 @@ def _piece(number: int) -> Segment:
         for k in range(1, RINGS)
     ]
     vertices = np.concatenate([first, last, *rings])
-    disc, rim = len(first), 1 + SIDES
+    disc = len(first)
+    rim = 1 + SIDES
     loops = np.array([rim, *(2 * disc + SIDES * k for k in range(RINGS - 1)), disc + rim])
-    i, j = np.arange(SIDES), (np.arange(SIDES) + 1) % SIDES
+    i = np.arange(SIDES)
+    j = (np.arange(SIDES) + 1) % SIDES
     side = [
         np.concatenate([np.stack([a + i, b + i, b + j], axis=1), np.stack([a + i, b + j, a + j], axis=1)])
         for a, b in pairwise(loops)
@@ -92,7 +96,8 @@ def _piece(number: int) -> Segment:
 
 def _base() -> Segment:
     """A rounded block whose +x face carries the rope."""
-    size, rounding = np.array(BASE_SIZE), BASE_ROUNDING
+    size = np.array(BASE_SIZE)
+    rounding = BASE_ROUNDING
     core = manifold3d.Manifold.cube(tuple(size - 2 * rounding), True)
     ball = manifold3d.Manifold.sphere(rounding, 16)
     solid = core.minkowski_sum(ball).translate((-float(size[0]) / 2, 0.0, 0.0)).refine_to_length(2.5)
@@ -143,7 +148,8 @@ def centerline(bends: Bends) -> Float[np.ndarray, "m 3"]:
     step = NODES[1]
     sideways, forwards = (bends[:, 1:] + bends[:, :-1]) / 2
     turns = Rotation.from_rotvec(step * np.stack([np.zeros_like(sideways), -forwards, sideways], axis=1)).as_matrix()
-    frames, reach = np.concatenate([np.eye(3)[None], turns]), 1
+    frames = np.concatenate([np.eye(3)[None], turns])
+    reach = 1
     while reach < len(frames):  # products of ever more turns: seven rounds instead of one for each node
         frames[reach:] = frames[:-reach] @ frames[reach:]
         reach *= 2
@@ -167,7 +173,8 @@ def swing(rng: np.random.Generator) -> Bends:
 def coil(rng: np.random.Generator) -> Bends:
     """Bends of a helix from a random place on, in a random direction; its pitch keeps the turns apart."""
     start = named(rng, "start").uniform(0.05, 0.4) * LENGTH
-    rate, pitch = named(rng, "turn per unit", "rad").uniform(0.13, 0.2), named(rng, "pitch").uniform(*COIL_PITCH)
+    rate = named(rng, "turn per unit", "rad").uniform(0.13, 0.2)
+    pitch = named(rng, "pitch").uniform(*COIL_PITCH)
     direction = named(rng, "direction", "rad").uniform(0, 2 * np.pi)
     hand = named(rng, "hand").choice([-1.0, 1.0])
     # one turn takes an arc of 2 pi / rate, of which the sine of the slope is pitch; so a helix has its curvature

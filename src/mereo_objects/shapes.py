@@ -172,7 +172,8 @@ def _cone(rng: np.random.Generator) -> list[Deformation]:
 
 
 def _box(rng: np.random.Generator) -> list[Deformation]:
-    foot, height = cell_center("box"), solid.BOX_SIZE[2]
+    foot = cell_center("box")
+    height = solid.BOX_SIZE[2]
     return [
         Taper(foot, UP, height, _factor(rng, "taper", 0.8, 1.22)),
         Twist(foot, UP, height, _angle(rng, "twist", 0.7)),
@@ -191,7 +192,8 @@ def _ball(rng: np.random.Generator) -> list[Deformation]:
 
 
 def _star(rng: np.random.Generator) -> list[Deformation]:
-    foot, height = cell_center("star"), solid.STAR_HEIGHT
+    foot = cell_center("star")
+    height = solid.STAR_HEIGHT
     return [
         Taper(foot, UP, height, _factor(rng, "taper", 0.8, 1.2)),
         Twist(foot, UP, height, _angle(rng, "twist", 1.2)),
@@ -205,7 +207,8 @@ def _wedge(rng: np.random.Generator) -> list[Deformation]:
 
 
 def _arch(rng: np.random.Generator) -> list[Deformation]:
-    foot, across = cell_center("arch"), cell_axes("arch")[1]
+    foot = cell_center("arch")
+    across = cell_axes("arch")[1]
     height, reach = solid.ARCH_LEG + solid.ARCH_RADIUS, solid.ARCH_DEPTH / 2 + 1.0
     lean = Bend(foot, UP, across, height, _angle(rng, "lean", 0.6), reach)
     return [lean, Twist(foot, UP, height, _angle(rng, "twist", 0.7))]

@@ -172,7 +172,8 @@ def sample_deformation(rng: np.random.Generator, kind: str) -> Deformation | Non
     corners = _sample_corners(rng)
     heading = named(rng, "heading of the curve", "rad").uniform(0, 2 * np.pi)
     before = Compose((*corners, _turned(-heading)))
-    flat, lifted = _turned(-heading)(_middle()), before(_middle())
+    flat = _turned(-heading)(_middle())
+    lifted = before(_middle())
     with part(rng, "curve"):
         profile = sample_profile(rng, kind, float(flat[:, 0].min()), float(flat[:, 0].max()))
     curvature = np.abs(np.interp(lifted[:, 0], NODES, profile.curvature))

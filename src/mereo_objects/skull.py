@@ -169,8 +169,10 @@ def _teeth(row: str) -> manifold3d.Manifold:
 @cache
 def rest_mesh() -> SegmentedMesh:
     """Skull with its mouth closed."""
-    upper, cranium = _teeth("u"), _solid("skull_bone")
-    lower, mandible = _moved(_teeth("l"), SEAT), _solid("jaw_bone_j")
+    upper = _teeth("u")
+    cranium = _solid("skull_bone")
+    lower = _moved(_teeth("l"), SEAT)
+    mandible = _solid("jaw_bone_j")
     solids = {
         "upper_teeth": upper,
         "cranium": main_part(cranium - upper),
@@ -205,7 +207,8 @@ def condyles() -> Condyles:
 
 def sample_deformations(rng: np.random.Generator) -> tuple[Deformation, ...]:
     """Random rigid motion of mandible and lower teeth; the cranium stays."""
-    still, jaw = Identity(), jaw_motion(condyles(), *sample_jaw(rng))
+    still = Identity()
+    jaw = jaw_motion(condyles(), *sample_jaw(rng))
     return (still, still, jaw, jaw)
 
 

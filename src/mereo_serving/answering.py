@@ -125,7 +125,9 @@ class Answerer:
             return refusal(error, frame)
 
     def _answer(self, frame: FrameRequest) -> Reply:
-        started, messages, loaded = time.perf_counter(), list[str](), self.loaded[frame.weights]
+        started = time.perf_counter()
+        messages = list[str]()
+        loaded = self.loaded[frame.weights]
         with option_words(), taken_warnings(messages, frame):
             read = read_frame(frame.path, frame.reading)
             if len(read.cloud) > self.setup.max_points:
@@ -156,8 +158,10 @@ def json_of(result: Result, warned: list[str]) -> bytes:
 
 def glb_of(result: Result, request: FrameRequest) -> bytes:
     """Content of segments.glb."""
-    frame, path = result.seen.frame, request.folder / "segments.glb"
-    to_viewer, radii = viewer_rotation(frame.axes), radii_of(result.registered)
+    frame = result.seen.frame
+    path = request.folder / "segments.glb"
+    to_viewer = viewer_rotation(frame.axes)
+    radii = radii_of(result.registered)
     write_segments_glb(path, result.reconstruction.surfaces, to_viewer, frame.metres, radii)
     return path.read_bytes()
 

@@ -119,7 +119,8 @@ class Service:
         options.reading(self.root, None, None)  # what is wrong with it is said before the body comes
         if int(request.headers.get("content-length", 0)) > self.config.max_body:
             raise too_large(self.config.max_body)
-        place, folder = self.dispatcher.admit(), self.root / secrets.token_hex(8)
+        place = self.dispatcher.admit()
+        folder = self.root / secrets.token_hex(8)
         try:
             folder.mkdir()
             kind = request.headers.get("content-type", "")

@@ -140,7 +140,8 @@ def _suffix(part: str, content: UploadFile | str, stated: str) -> str:
         if part == "intrinsics":
             return ".json"
         raise Refused(415, f"the part {part!r} is text without a file name: send it as a file")
-    given, kind = content.filename or "", (content.content_type or "").partition(";")[0].strip().lower()
+    given = content.filename or ""
+    kind = (content.content_type or "").partition(";")[0].strip().lower()
     end = PurePosixPath(given.replace("\\", "/")).suffix.lower()
     if part == "mask":
         return end if end in MASKS else ".png"

@@ -109,7 +109,9 @@ class Gate:
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
-        started, code, body = time.perf_counter(), 499, _Body(scope, receive)
+        started = time.perf_counter()
+        code = 499
+        body = _Body(scope, receive)
 
         async def answer(message: Any) -> None:
             nonlocal code

@@ -60,7 +60,8 @@ def serve(
             "exceed: lower the one or raise the other"
         )
     setup = Setup(tuple(served), method, inference or InferenceConfig(), config.max_points, config.max_body)
-    entry, metrics = Entry.of(address[0]), Metrics()
+    entry = Entry.of(address[0])
+    metrics = Metrics()
     with ExitStack() as stack:
         socket = stack.enter_context(bound_socket(*address))
         processes = stack.enter_context(started(setup, workers))

@@ -89,7 +89,8 @@ class Display:
         """Draw the axes of the input's frame from a corner, each as long as ``length``, for which ``text`` stands."""
         ends = self.place(corner + length * np.eye(3))
         lines = np.stack([np.broadcast_to(self.place(corner), (3, 3)), ends], axis=1)
-        scene, colors = self.server.scene, np.repeat(np.array(AXIS_COLORS)[:, None], 2, axis=1)
+        scene = self.server.scene
+        colors = np.repeat(np.array(AXIS_COLORS)[:, None], 2, axis=1)
         scene.add_line_segments("/axes", lines, colors, thickness=3.0, thickness_units="screen")
         for name, end in zip("xyz", ends, strict=True):
             scene.add_label(f"/axes/{name}", f"{name} {text}", position=tuple(end), anchor="center-center")
@@ -190,13 +191,15 @@ class SegmentLayer:
 
         ``colors`` holds one colour per vertex for each segment; ``shift`` is on the stage. Surfaces keep their creases.
         """
-        visible, opacity = controls.visible(), controls.opacity()
+        visible = controls.visible()
+        opacity = controls.opacity()
         offset = np.zeros(3) if shift is None else shift
         self.clear_from(len(mesh.segments))
         handles = []
         for k, whole in enumerate(mesh.segments):
             segment, source = split_at_creases(whole)
-            name, is_on = f"{self.name}/{k}", visible[k] and len(segment.faces) > 0
+            name = f"{self.name}/{k}"
+            is_on = visible[k] and len(segment.faces) > 0
             vertices = self.stage.place(segment.vertices) + offset if len(segment.vertices) else np.zeros((3, 3))
             faces = segment.faces if len(segment.faces) else np.array([[0, 1, 2]])
             add = self.stage.server.scene
@@ -310,7 +313,8 @@ def message(text: str, bad: bool = False) -> str:
 
 def color_bar(scale: ColorScale) -> str:
     """Bar with all colours of a scale, and what stands below it."""
-    stops, words = ",".join(map(css, scale.stops)), "".join(f"<span>{escape(w)}</span>" for w in scale.words)
+    stops = ",".join(map(css, scale.stops))
+    words = "".join(f"<span>{escape(w)}</span>" for w in scale.words)
     return (
         f'<div style="{BOX}"><div>{escape(scale.title)}</div><div style="height:9px;border-radius:5px;margin:3px 0;'
         f'background:linear-gradient(90deg,{stops})"></div><div style="display:flex;justify-content:space-between;'

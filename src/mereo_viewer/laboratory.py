@@ -127,8 +127,10 @@ class Laboratory:
 
         Raises ``ValueError`` where fewer than ``MIN_POINTS`` points of the object are seen.
         """
-        state, workspace = self.scene.deform(shape.deformations), self.scene.workspace
-        center, cosine = state.mesh.bounds.mean(axis=0), float(np.cos(place.tilt_rad))
+        state = self.scene.deform(shape.deformations)
+        workspace = self.scene.workspace
+        center = state.mesh.bounds.mean(axis=0)
+        cosine = float(np.cos(place.tilt_rad))
         T_world_camera = workspace.pose(center, cosine, place.azimuth_rad, place.distance)
         mesh = state.mesh.transformed(inverse_rigid(T_world_camera))
         camera = Camera.from_fov(64, 64, workspace.fov_rad)
@@ -148,7 +150,8 @@ class Laboratory:
         started = time.perf_counter()
         seen = observe_cloud(view.depth.to_points(), unit_m=self.scene.unit_m)
         answer = answer_frame(seen, self.network, self.registrar, resolution=96)
-        surfaces, seconds = answer.surfaces, time.perf_counter() - started
+        surfaces = answer.surfaces
+        seconds = time.perf_counter() - started
         truth = truth_grid(view.mesh, CELLS)
         confusion = grid_confusion(truth, labels_on(surfaces, truth.grid), len(surfaces.segments))
         scores = intersection_over_union(confusion, len(surfaces.segments) == len(view.mesh.segments))
@@ -391,7 +394,8 @@ class LabPage:
             view, trial = self.view, self.trial
             if view is None:
                 return
-            T_world_camera, aside = view.T_world_camera, self._aside(view)
+            T_world_camera = view.T_world_camera
+            aside = self._aside(view)
             self.truth.show(view.mesh.transformed(T_world_camera), self.controls, shift=aside)
             self.points.show(PointCloud(transform_points(T_world_camera, view.depth.to_points().points)), -aside)
             while self._names:

@@ -169,7 +169,9 @@ def probe_html(
     probed: Probed, names: Sequence[str], colors: Sequence[Color], point: Float[np.ndarray, "3"], unit: Unit
 ) -> str:
     """Facts about one point: its segment, the network's likeliest classes, distance, direction, and where it rests."""
-    label, distance, direction = int(probed.label[0]), float(probed.distance[0]), probed.direction[0]
+    label = int(probed.label[0])
+    distance = float(probed.distance[0])
+    direction = probed.direction[0]
     radius = None if probed.radius95 is None else float(probed.radius95[0])
     where = f"at {unit.place(point, radius)} {unit.length_name}"
     where += "" if radius is None else " (95\N{NO-BREAK SPACE}%)"
@@ -280,7 +282,8 @@ def _opened(content: Content, port: int) -> OpenPage:
 def content_of_answer(answer: Answer) -> Content:
     """Content of an answer; raises ``ValueError`` where there are no surfaces."""
     frame, mesh, cloud = answer.seen.frame, answer.reconstruction.surfaces, answer.reconstruction.reading.cloud
-    unit, radii = Unit(frame.unit_m), radii_of(answer.registered)
+    unit = Unit(frame.unit_m)
+    radii = radii_of(answer.registered)
     made_with = "no weights" if answer.model is None else f"weights {answer.model.name or 'of this program'}"
     depth = None if frame.depth is None else (depth_picture(frame.depth), depth_ends(frame.depth, unit))
     colorings: dict[str, Coloring] = {}
@@ -316,7 +319,8 @@ def content_of_files(path: Path) -> Content:
     """
     folder = path.parent if path.name == STATE else path
     if is_glb(path):
-        scene, report = read_glb(path), None
+        scene = read_glb(path)
+        report = None
         # glTF's metres; a file of ours has the same number where the unit of its input was not known
         unit = UNKNOWN if scene.is_ours and scene.unit_m == 1.0 else Unit(scene.unit_m)
     else:
@@ -325,7 +329,8 @@ def content_of_files(path: Path) -> Content:
             raise FileNotFoundError(
                 f"{folder} has no {surfaces.name}, which the page of a result shows: write it again with --formats glb"
             )
-        scene, report = read_glb(surfaces), read_report(folder / REPORT)
+        scene = read_glb(surfaces)
+        report = read_report(folder / REPORT)
         scene = replace(scene, mesh=_nested(scene.mesh, folder / WRITERS["json"].file))
         unit = Unit(scene.unit_m) if report is not None and report.unit_known else UNKNOWN
     cloud = None if report is None else report.cloud
@@ -563,10 +568,12 @@ class ResultPage:
     def probe(self, point: Float[np.ndarray, "3"]) -> None:
         """Say what is known of a point of the input's frame, and draw the way to the nearest surface."""
         assert self.content.ask is not None
-        answer, mesh = self.content.ask(point[None]), self.content.mesh
+        answer = self.content.ask(point[None])
+        mesh = self.content.mesh
         names, colors = ("empty space", *mesh.names), (EMPTY_COLOR, *mesh.colors)
         self.facts.content = probe_html(answer, names, colors, point, self.content.unit)
-        distance, direction = float(answer.distance[0]), answer.direction[0]
+        distance = float(answer.distance[0])
+        direction = answer.direction[0]
         if np.isnan(distance) or np.isnan(direction).any():
             return
         start = self.stage.place(point)

@@ -96,7 +96,8 @@ def local_pages_only() -> Iterator[list[str]]:
     """
     from websockets.asyncio import server
 
-    serve, checked = server.serve, list[str]()
+    serve = server.serve
+    checked = list[str]()
 
     def serve_local_pages(*arguments: Any, **options: Any) -> Any:
         checked.append("checked")

@@ -127,11 +127,14 @@ def test_nobodys_files_are_replaced(result: Result, tmp_path: Path) -> None:
 
 
 def test_values_tell_themselves_in_one_line(result: Result) -> None:
-    rope, camera, found = load_scene("rope"), Camera.from_fov(4, 3, 0.5), result.reconstruction
+    rope = load_scene("rope")
+    camera = Camera.from_fov(4, 3, 0.5)
+    found = result.reconstruction
     parts = [found.surfaces, found.surfaces.segments[0], found.labels, found.segments, found.code, found.reading]
     empty = [PointCloud(np.zeros((0, 3))), DepthImage(np.zeros((3, 4)), camera)]
     frames = [result.seen, result.seen.frame, result.seen.cloud, *empty]
-    image, evaluation = DepthImage(np.full((3, 4), 2.0), camera), Evaluation(("a",), np.array([[5, 1], [1, 3]]), {})
+    image = DepthImage(np.full((3, 4), 2.0), camera)
+    evaluation = Evaluation(("a",), np.array([[5, 1], [1, 3]]), {})
     located = Located(np.ones(1, np.uint8), np.zeros(1), np.zeros((1, 3)), np.zeros((1, 3)))
     asked = MODEL.query(found.code, seen()[:5])
     known = [untrained(("a",)), rope, toy_scene(), image, asked, located, evaluation]
@@ -192,7 +195,8 @@ def test_fields_of_isolation_are_arguments_by_themselves(monkeypatch: pytest.Mon
 
 
 def test_a_tracker_begins_at_a_pose_and_leaves_out_what_it_is_told() -> None:
-    cloud, liver = load_view("liver").depth.to_points().points, load_model("liver")
+    cloud = load_view("liver").depth.to_points().points
+    liver = load_model("liver")
     pose = Result.of(answer_to(cloud, liver, Registrar.of(liver, "modes"), 16, unit_m=UNIT_M)).pose
     known = mereo.Object(None, None, model=liver.statistical_model)
     low, high = UNIT_M * (cloud.min(axis=0) - 1), UNIT_M * (cloud.max(axis=0) + 1)

@@ -225,7 +225,8 @@ def test_one_mesh_is_an_object_too(boxes: mereo.Object) -> None:
 
 # --- what comes out ---------------------------------------------------------------------------------------------------
 
-UNIT_M, FILES = 0.01, np.diag([4.0, 4.0, 4.0, 1.0])
+UNIT_M = 0.01
+FILES = np.diag([4.0, 4.0, 4.0, 1.0])
 """Metres per scene unit of the rope, and what brings its files to the scene."""
 
 T_BASE = rigid(Rotation.from_euler("xyz", [100, 20, -60], degrees=True).as_matrix(), np.array([5.0, -3.0, 2.0]))
@@ -245,7 +246,8 @@ def results(rope: Model) -> Results:
     assert rope.statistical_model is not None
     sized, free = (replace(rope.statistical_model, source_frame=SourceFrame(FILES, unit)) for unit in (UNIT_M, None))
     cloud = load_view("rope").depth.to_points().points
-    scan, known = 1000 * UNIT_M * cloud @ SCANNER_TO_CAMERA[:3, :3], Registrar(rope, sized, "modes")
+    scan = 1000 * UNIT_M * cloud @ SCANNER_TO_CAMERA[:3, :3]
+    known = Registrar(rope, sized, "modes")
     answers = (
         answer_to(UNIT_M * cloud, rope, known, 16, unit_m=1.0),
         answer_to(scan, rope, known, 16, "scanner", 0.001),
@@ -254,7 +256,8 @@ def results(rope: Model) -> Results:
     made = dict(zip(FITTED, map(Result.of, answers), strict=True))
     made["a network"] = answered(resolution=24, unit_m=1.0, label_points=True)
     waiting = type("Waiting", (Executor,), {"submit": lambda *_, **__: Future()})()
-    alone, pose = mereo.Object(None, None, model=sized), made["metres"].pose
+    alone = mereo.Object(None, None, model=sized)
+    pose = made["metres"].pose
     with mereo.Tracker(alone, "modes", executor=waiting, initial_pose=pose) as tracker:
         for step in range(2):
             made["lost"] = tracker.follow(UNIT_M * (cloud + 40 * step), 0.03 * step, unit_m=1.0)
@@ -358,7 +361,8 @@ def test_a_folder_is_loaded_as_it_was_saved(kind: str, results: Results, tmp_pat
 def test_what_was_loaded_is_transformed_saved_and_carries_as_the_result_does(
     kind: str, results: Results, tmp_path: Path
 ) -> None:
-    whole, moved = results[kind], results[kind].transformed(T_BASE)
+    whole = results[kind]
+    moved = results[kind].transformed(T_BASE)
     known = mereo.Object(None, model=whole.registrar.model) if kind in FITTED else None
     stored = mereo.load_result(whole.save(tmp_path / "whole"), known).transformed(T_BASE)
     again = mereo.load_result(stored.save(tmp_path / "again", millimetres=True), known)
@@ -390,9 +394,12 @@ def test_a_lost_object_says_so_in_every_form(results: Results) -> None:
 
 @pytest.mark.parametrize("kind", ANSWERED)
 def test_a_result_in_a_robots_frame_is_the_same_there(kind: str, results: Results) -> None:
-    result, moved = results[kind], results[kind].transformed(T_BASE)
+    result = results[kind]
+    moved = results[kind].transformed(T_BASE)
     near = partial(assert_allclose, atol=1e-9 * np.ptp(result.surfaces.merged()[0]), rtol=1e-9)
-    place, facts, labels = partial(transform_points, T_BASE), moved.to_dict(), moved.labels
+    place = partial(transform_points, T_BASE)
+    facts = moved.to_dict()
+    labels = moved.labels
     near(moved.surfaces.merged()[0], place(result.surfaces.merged()[0]))
     near(moved.transformed(facts["T_input_result"]).surfaces.bounds, result.surfaces.bounds)
     assert facts["frame"] == "other"

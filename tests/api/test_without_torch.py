@@ -209,7 +209,8 @@ def test_every_block_of_a_page_runs_as_printed(page: str, clone: Path, monkeypat
     """In the order of the page; those after a paragraph that installs PyTorch with it, all others without."""
     for library in ("viser", "fastapi", "onnxscript", "yourdfpy"):
         pytest.importorskip(library)
-    text, done = PAGES[page].read_text("utf-8"), 0
+    text = PAGES[page].read_text("utf-8")
+    done = 0
     if page == "docs/quickstart.md":
         program = "".join(blocks(PYTHON, "python"))
         text += f"{ANSWERS.read_text('utf-8')}\n\npip install '[network]'\n\n```python\n{program}```"

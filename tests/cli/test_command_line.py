@@ -162,7 +162,8 @@ def test_command_calls_the_library_with_its_options(
 ) -> None:
     place, expected = CALLS[line]
     module, _, function = place.rpartition(".")
-    library, calls = import_module(module), list[dict[str, object]]()
+    library = import_module(module)
+    calls = list[dict[str, object]]()
     signature = inspect.signature(getattr(library, function))
 
     def called(*given: object, **named: object) -> Outcome:

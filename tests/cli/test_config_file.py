@@ -106,7 +106,8 @@ def test_a_runs_own_settings_are_such_a_file(tmp_path: Path) -> None:
 def test_what_is_wrong_with_a_file_is_one_sentence(
     content: Any, sentence: str, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    path, out = str(written(tmp_path, content)), tmp_path / "out"
+    path = str(written(tmp_path, content))
+    out = tmp_path / "out"
     assert run_mereo("reconstruct", "a", "--weights", "w", "--output", out, "--config", path) == 2
     said = capsys.readouterr().err
     assert sentence in said and said.count("\n") == 1 and not out.exists(), said

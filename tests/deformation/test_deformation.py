@@ -59,7 +59,8 @@ def make_window(rng: Generator) -> Deformation:
 def make_sweep(rng: Generator) -> Deformation:
     """A slice of a helix of curvature 0.9 / REACH at most, so that the whole cube stays within its reach."""
     nodes = np.linspace(-HALF, HALF, 81)
-    radius, rise = REACH / 0.9, rng.uniform(0.0, 20.0)
+    radius = REACH / 0.9
+    rise = rng.uniform(0.0, 20.0)
     t = nodes / np.hypot(radius, rise)
     return CurveSweep.through(
         nodes, np.stack([radius * np.cos(t), radius * np.sin(t), rise * t], 1), direction(rng), REACH
@@ -98,7 +99,8 @@ def test_jacobian_is_positive(name: str, seed: int) -> None:
 @pytest.mark.parametrize("name", MAKERS)
 def test_points_move_independently_of_each_other(name: str) -> None:
     rng = default_rng(1)
-    deformation, points = MAKERS[name](rng), cube(rng)
+    deformation = MAKERS[name](rng)
+    points = cube(rng)
     before = points.copy()
     together = deformation(points)
     assert np.array_equal(points, before)
@@ -110,7 +112,8 @@ def test_points_move_independently_of_each_other(name: str) -> None:
 def test_inverse_of_the_image_is_the_point(name: str) -> None:
     rng = default_rng(2)
     for _ in range(5):
-        deformation, points = MAKERS[name](rng), cube(rng)
+        deformation = MAKERS[name](rng)
+        points = cube(rng)
         guess = points + rng.normal(scale=0.3, size=points.shape)
         found, converged = invert(deformation, deformation(points), guess)
         assert converged.mean() > 0.99
@@ -143,7 +146,9 @@ def test_jacobian_of_a_linear_map_is_its_matrix_at_any_scale() -> None:
 
 def test_composition_applies_the_first_part_first() -> None:
     rng = default_rng(3)
-    turn, twist, points = MAKERS["rigid"](rng), MAKERS["twist"](rng), cube(rng)
+    turn = MAKERS["rigid"](rng)
+    twist = MAKERS["twist"](rng)
+    points = cube(rng)
     assert np.array_equal(Compose((turn, twist))(points), twist(turn(points)))
     assert np.abs(Compose((turn, twist))(points) - Compose((twist, turn))(points)).max() > 0.1
     nested = Compose((Compose((turn, twist)), Compose(())))
@@ -191,14 +196,16 @@ def test_smooth_field_changes_distances_within_its_bound(seed: int, strength: fl
     rng = default_rng(seed)
     field = SmoothField.sample(rng, strength, (5.0, 30.0))
     assert np.isclose(field.gradient_bound, strength)
-    x, y = cube(rng), cube(rng) * rng.choice([1e-2, 1.0])
+    x = cube(rng)
+    y = cube(rng) * rng.choice([1e-2, 1.0])
     ratio = norm(field(x) - field(y), axis=1) / norm(x - y, axis=1)
     assert ratio.min() >= 1 - strength - 1e-9 and ratio.max() <= 1 + strength + 1e-9
 
 
 def test_lattice_equals_the_sum_of_b_splines() -> None:
     rng = default_rng(7)
-    lattice, points = MAKERS["lattice"](rng), cube(rng, 40) * 1.6
+    lattice = MAKERS["lattice"](rng)
+    points = cube(rng, 40) * 1.6
     at = (points - lattice.origin) / lattice.spacing
     basis = BSpline.basis_element(np.arange(-2.0, 3.0), extrapolate=False)
     expected = points.copy()
@@ -213,7 +220,8 @@ def test_lattice_equals_the_sum_of_b_splines() -> None:
 def test_lattice_at_its_limit_stays_positive_even_when_neighbours_oppose() -> None:
     """Each of the 4^3 control points around a cell takes the sign that pushes against its gradient."""
     signs = np.sign(np.arange(8) - 3.5)
-    spacing, limit = np.full(3, 5.0), 5.0 / 2.4801
+    spacing = np.full(3, 5.0)
+    limit = 5.0 / 2.4801
     grid = np.stack(np.meshgrid(-signs, -signs, -signs, indexing="ij"), axis=-1)
     lattice = FreeFormLattice(np.zeros(3), spacing, limit * grid)
     points = default_rng(8).uniform(12.0, 23.0, size=(4000, 3))
@@ -226,7 +234,8 @@ def test_lattice_at_its_limit_stays_positive_even_when_neighbours_oppose() -> No
 def test_window_is_its_inner_map_inside_and_nothing_outside() -> None:
     rng = default_rng(9)
     inner = Rigid(np.array([0.0, 0, 0.3]), np.array([0.5, 0, 0]), np.zeros(3))
-    window, points = Localized(inner, np.ones(3), 3.0, 9.0), cube(rng, 4000)
+    window = Localized(inner, np.ones(3), 3.0, 9.0)
+    points = cube(rng, 4000)
     distance = norm(points - 1.0, axis=1)
     assert np.allclose(window(points)[distance < 3], inner(points)[distance < 3])
     assert np.array_equal(window(points)[distance > 9], points[distance > 9])
@@ -262,7 +271,8 @@ def test_transported_frames_are_rotations_that_do_not_twist() -> None:
     assert np.isclose(turn, min(enclosed, 2 * pi - enclosed), atol=0.02)
 
 
-ORIGIN, Z = np.zeros(3), np.array([0.0, 0.0, 1.0])
+ORIGIN = np.zeros(3)
+Z = np.array([0.0, 0.0, 1.0])
 REFUSED = {
     "bend": (
         lambda: Bend(ORIGIN, *np.eye(3)[[2, 0]], 4.0, 2.0, 3.0),

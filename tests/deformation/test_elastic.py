@@ -61,7 +61,8 @@ def covariance(scale: float = 1.0, young: float = 1.0, power: float = 2.0) -> nd
 
 
 def test_the_lattice_holds_the_mesh_and_its_volume() -> None:
-    mesh, made = block(), solid()
+    mesh = block()
+    made = solid()
     assert (made.mesh.locate(mesh.segments[0].vertices) >= 0).all()
     assert_allclose(made.volumes.sum(), mesh.segments[0].volume, rtol=0.05)
     assert_allclose(made.mass.sum(), made.volumes.sum(), rtol=1e-12)
@@ -92,7 +93,9 @@ def test_stiffness_is_symmetric_and_rigid_motions_cost_nothing(poisson: float) -
 
 def test_a_stretch_costs_its_strain_energy() -> None:
     """Closed form: E (1 - nu) / ((1 + nu) (1 - 2 nu)) e^2 / 2 for each unit of filled volume."""
-    body, nu, stretch = partly_filled(), 0.3, 0.01
+    body = partly_filled()
+    nu = 0.3
+    stretch = 0.01
     motion = np.zeros_like(body.mesh.nodes)
     motion[:, 0] = stretch * body.mesh.nodes[:, 0]
     energy = motion.ravel() @ (assemble_stiffness(body, Material(nu, young=7.0)) @ motion.ravel()) / 2
@@ -140,12 +143,15 @@ def test_no_coefficients_are_the_rest_and_small_ones_are_linear() -> None:
 
 
 def test_drawn_states_keep_their_volume_and_centre() -> None:
-    body, scaled = solid(), scale_modes(*modes(), motion=0.1 * 2.5)
-    state, share = StateMap(body, scaled), body.volumes / body.volumes.sum()
+    body = solid()
+    scaled = scale_modes(*modes(), motion=0.1 * 2.5)
+    state = StateMap(body, scaled)
+    share = body.volumes / body.volumes.sum()
     changes = []
     for seed in range(40):
         coefficients = default_rng(seed).normal(size=COUNT)
-        drawn, linear = state(coefficients).nodes, body.mesh.nodes + scaled @ coefficients
+        drawn = state(coefficients).nodes
+        linear = body.mesh.nodes + scaled @ coefficients
         ratios = body.mesh.volume_ratios(drawn)
         assert ratios.min() > 0.3
         changes.append([share @ ratios - 1, share @ body.mesh.volume_ratios(linear) - 1])
@@ -158,7 +164,9 @@ def test_drawn_states_keep_their_volume_and_centre() -> None:
 def test_no_drawn_state_folds_or_swells_however_large_the_motion() -> None:
     """At a motion at which most of the prior's states turn tetrahedra inside out, and their volume by a tenth."""
     sampler = ElasticSampler(solid(), Material(), COUNT, 0.5 * 2.5)
-    state, share, calmed = StateMap(solid(), sampler.modes), solid().volumes / solid().volumes.sum(), 0
+    state = StateMap(solid(), sampler.modes)
+    share = solid().volumes / solid().volumes.sum()
+    calmed = 0
     for seed in range(12):
         drawn = sampler(default_rng(seed), no_surface)
         ratios = solid().mesh.volume_ratios(drawn.nodes)
@@ -181,7 +189,8 @@ def test_a_stiffer_part_bends_less() -> None:
     def energies(body: ElasticSolid) -> ndarray:
         """Strain energy of each half in the softest modes, under the same stiffness."""
         _, vectors = find_modes(body, 4, Material())
-        center, flat = body.mesh.nodes[body.mesh.elements].mean(axis=1)[:, 0], vectors.reshape(-1, 4)
+        center = body.mesh.nodes[body.mesh.elements].mean(axis=1)[:, 0]
+        flat = vectors.reshape(-1, 4)
         sides = (np.where(side, 1.0, 1e-9) for side in (center < 3, center > 3))
         halves = (assemble_stiffness(ElasticSolid(body.mesh, body.filled, side), Material()) for side in sides)
         return np.array([np.einsum("ik,ik->", flat, stiffness @ flat) for stiffness in halves])
@@ -200,7 +209,8 @@ def test_what_is_held_does_not_move_and_nothing_is_rigid() -> None:
     values, vectors = find_modes(solid(), COUNT, Material(), held)
     assert (vectors[held] == 0).all() and (np.abs(vectors[~held]).max(axis=(1, 2)) > 0).all()
     assert (np.diff(values) >= 0).all() and values[0] > 0
-    flat, mass = vectors.reshape(-1, COUNT), np.repeat(solid().mass, 3) / solid().mass.sum()
+    flat = vectors.reshape(-1, COUNT)
+    mass = np.repeat(solid().mass, 3) / solid().mass.sum()
     assert_allclose(flat.T @ (mass[:, None] * flat), np.eye(COUNT), atol=1e-6)
     free = find_modes(solid(), COUNT, Material())[0]
     assert values[0] < free[0], "a cantilever is softer than a free bar"

@@ -19,7 +19,8 @@ from mereo.deformation.tetrahedral import Tetrahedra, TetrahedralMap
 from mereo.io.simulation_states import TetrahedralRecord, read_states
 from mereo.scenes.recorded_states import SplitStates, load_states
 
-SCALE, SHIFT = 0.5, (1.0, -2.0, 3.0)
+SCALE = 0.5
+SHIFT = (1.0, -2.0, 3.0)
 """From the files' coordinates to those of the scene, in which ``boxes`` are."""
 
 
@@ -138,7 +139,8 @@ def collection(path: Path) -> Written:
     (path / "run.pvd").write_text(pvd_text([f"parts/{frame}.vtu" for frame in range(10)]), encoding="utf-8")
     from vtkmodules.vtkIOXdmf2 import vtkXdmfWriter
 
-    writer, folder = vtkXdmfWriter(), os.getcwd()
+    writer = vtkXdmfWriter()
+    folder = os.getcwd()
     os.chdir(path)  # it names the HDF5 file as it is told
     try:
         writer.SetFileName("mesh.xdmf")
@@ -188,7 +190,8 @@ def load_written(written: Path | Written) -> SplitStates:
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_same_states(name: str, tmp_path: Path) -> None:
     split = load_written(FORMATS[name](tmp_path))
-    frames, truth = split.training.frames, moved_vertices()
+    frames = split.training.frames
+    truth = moved_vertices()
     assert frames.count == 10 and (split.training.end, split.testing.first) == (9, 9)
     for frame in range(10):
         for part, deformation in zip(boxes().segments, frames.deformations(frame), strict=True):

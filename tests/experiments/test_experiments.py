@@ -155,7 +155,8 @@ def test_answers_side_by_side_are_drawn_from_results(name: str, picture: str, co
 
 @pytest.mark.slow
 def test_a_store_makes_each_thing_once(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    store, recipe = Store(tmp_path), replace(SCALES["smoke"].recipe, epochs=0.1)
+    store = Store(tmp_path)
+    recipe = replace(SCALES["smoke"].recipe, epochs=0.1)
     settings = replace(GenerateConfig(), noise_std=0.5)
     for _ in range(2):
         dataset = store.dataset("rope", settings, 64)
@@ -183,7 +184,8 @@ MACHINE = Machine(1e11, 1e10)
 
 
 def test_the_rival_answers_as_the_model() -> None:
-    view, model = load_view("rope"), load_model("rope")
+    view = load_view("rope")
+    model = load_model("rope")
     cloud = view.depth.to_points()
     points = view.truth.grid.positions(default_rng(0).integers(0, 100, (500, 3)))
     ours = model.logits(model.encode(cloud), points)

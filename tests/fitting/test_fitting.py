@@ -236,7 +236,8 @@ def test_a_model_needs_two_states_whose_poses_do_not_matter() -> None:
 
 
 def test_draws_that_move_nothing_narrow_nothing(problem: DrawsProblem, drawn: DrawsFit) -> None:
-    one_moves, none_moves = drawn.motion.copy(), np.zeros_like(drawn.motion)
+    one_moves = drawn.motion.copy()
+    none_moves = np.zeros_like(drawn.motion)
     one_moves[:, :, 1:] = 0.0
     narrowed = [narrowing_of_draws(problem, replace(drawn, motion=motion)) for motion in (one_moves, none_moves)]
     assert narrowed[0] > 1.0

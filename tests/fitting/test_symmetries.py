@@ -102,7 +102,8 @@ def test_what_is_left_open_has_the_second_moments_of_the_turns() -> None:
     block = material[model.rest_points[:, 2] < 0.0]
     motion = left_open(model, material, block, 0.2, 1500.0).astype(np.float64)
     (turn,) = find_segment_turns(model)
-    weight, squared = np.append(turn.plausible, 1.0), np.zeros(len(material))
+    weight = np.append(turn.plausible, 1.0)
+    squared = np.zeros(len(material))
     wheel = model.labels == 2
     for angle, share in zip(turn.angles, weight / weight.sum(), strict=False):
         moved = Rotation.from_rotvec(angle * turn.axis).apply(model.rest_points[wheel] - turn.center) + turn.center

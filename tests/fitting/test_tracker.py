@@ -62,7 +62,9 @@ def mesh_of(model: StatisticalModel, turn: int, share: float = 0.0) -> Segmented
 
 
 def view(mesh: SegmentedMesh, seed: int = 0, occluders: tuple[Capsule, ...] = ()) -> SimulatedView:
-    solids, rng, away = Solids(mesh), default_rng(seed), np.array([0.0, 0.0, 1.0])
+    solids = Solids(mesh)
+    rng = default_rng(seed)
+    away = np.array([0.0, 0.0, 1.0])
     wall = Backdrop(away, farthest(solids, away) + 60.0)
     return depth_sensor.observe(solids, CAMERA, 0.02, SENSORS["paper"], rng, around=Surroundings(occluders, wall))
 
@@ -241,7 +243,9 @@ def test_what_was_found_must_explain_the_newest_frame(
 def test_the_own_thread_blocks_no_frame_and_ends(
     registrar: Registrar, frames: dict[str, Observation], searches: Searches, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    waiting, goes_on, search = threading.Event(), threading.Event(), answer_frame.search_hypotheses
+    waiting = threading.Event()
+    goes_on = threading.Event()
+    search = answer_frame.search_hypotheses
 
     def slow(seen: Observation, *rest: Any) -> Candidate:
         waiting.set()
@@ -310,7 +314,8 @@ def crossing(registrar: Registrar) -> list[tuple[SegmentedMesh, SimulatedView]]:
     frames = []
     for number in range(FRAMES):
         mesh = mesh_of(registrar.model, 20, 0.3 * number / FRAMES)
-        low, high = vertices(mesh).min(axis=0), vertices(mesh).max(axis=0)
+        low = vertices(mesh).min(axis=0)
+        high = vertices(mesh).max(axis=0)
         tool: tuple[Capsule, ...] = ()
         if BEFORE <= number < AFTER:
             share = np.sin(np.pi * (number - BEFORE + 0.5) / (AFTER - BEFORE))

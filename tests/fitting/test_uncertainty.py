@@ -66,7 +66,8 @@ def sure(found: Registration) -> Uncertainty:
 
 
 def test_the_radius_holds_95_percent_of_a_gaussian() -> None:
-    one, three = np.diag([4.0, 0.0, 0.0]), 4.0 * np.eye(3)
+    one = np.diag([4.0, 0.0, 0.0])
+    three = 4.0 * np.eye(3)
     assert_allclose(radius95(np.stack([one, three])), 2.0 * np.sqrt(chi2.ppf(0.95, [1, 3])), rtol=1e-9)
     rng = default_rng(0)
     for spread in ([1.0, 0.5, 0.1], [1.0, 1.0, 0.0], [1.0, 0.2, 0.2]):

@@ -205,7 +205,8 @@ def test_a_segment_in_a_nested_one_comes_before_it_whatever_the_order_of_their_l
 
 
 def test_what_mereo_writes_for_slicer_comes_back_with_all_letters_of_its_names_and_its_colours(tmp_path: Path) -> None:
-    labels, colors = np.kron(np.eye(2), np.ones((4, 4)))[..., None].repeat(5, axis=2), ((250, 1, 2), (3, 128, 5))
+    labels = np.kron(np.eye(2), np.ones((4, 4)))[..., None].repeat(5, axis=2)
+    colors = ((250, 1, 2), (3, 128, 5))
     labels[4:] *= 2
     grid = LabelGrid(labels.astype(np.uint8), ORIGIN, SPACING, ("Größe", "肝臓"))
     write_labels_seg_nrrd(tmp_path / "a.seg.nrrd", grid, colors, 0.001)
@@ -277,7 +278,8 @@ def test_what_is_lost_is_reported_and_what_is_too_thin_can_be_left_out(tmp_path:
         scene_of_meshes([file])
 
 
-BOX, BALL = box((-0.5, -1.0, -1.5), (0.5, 1.0, 1.5)), ball((4.0, 0.0, 0.0), 1.0, color=1, level=3)
+BOX = box((-0.5, -1.0, -1.5), (0.5, 1.0, 1.5))
+BALL = ball((4.0, 0.0, 0.0), 1.0, color=1, level=3)
 
 
 def check(segment: Segment) -> Segment:

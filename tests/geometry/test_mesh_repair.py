@@ -350,7 +350,8 @@ def truth(points: ndarray, part: Segment) -> ndarray:
 
 @pytest.mark.parametrize("part", [holed(), crossing()], ids=["hole", "self-intersection"])
 def test_points_and_grids_are_labelled_as_of_the_solid(part: Segment) -> None:
-    axis, points = np.linspace(-2.7, 3.7, 33), default_rng(0).uniform(-3, 4, size=(4000, 3))
+    axis = np.linspace(-2.7, 3.7, 33)
+    points = default_rng(0).uniform(-3, 4, size=(4000, 3))
     found = Solids(one(part)).label(points), label_grid(one(part), axis, axis, axis)
     for labels, places in zip(found, (points, nodes(axis, axis, axis)), strict=True):
         clear = (np.abs(truth(places, part)) > 0.06) & (norm(places - [2, 0, 0], axis=-1) > 0.6)
@@ -435,7 +436,8 @@ def test_nearest_over_all_segments_is_the_least_of_each_segments_distance() -> N
 def test_labels_are_right_beyond_a_billionth_of_the_longest_side(seed: int, unit: float, shift: float) -> None:
     """As ``Solids.label`` states it, for points this close to faces, edges and corners, of small things too."""
     part, normal, offset = convex_polyhedron(seed)
-    side, rng = float(np.ptp(part.vertices, axis=0).max()), default_rng(seed)
+    side = float(np.ptp(part.vertices, axis=0).max())
+    rng = default_rng(seed)
     face = rng.integers(len(part.faces), size=40_000)
     corners = part.vertices[part.faces[face]]
     points = np.einsum("ni,nij->nj", rng.dirichlet((0.3, 0.3, 0.3), len(face)), corners)

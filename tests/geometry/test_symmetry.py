@@ -30,7 +30,8 @@ def moved(part: trimesh.Trimesh, x: float, y: float = 0.0, z: float = 0.0) -> tr
     return part.copy().apply_translation((x, y, z))
 
 
-CUBOID, BALL = box((20, 30, 50)), icosphere(radius=20, subdivisions=4)
+CUBOID = box((20, 30, 50))
+BALL = icosphere(radius=20, subdivisions=4)
 
 
 @pytest.mark.parametrize(
@@ -102,7 +103,9 @@ def test_a_fit_of_moved_points_is_the_motion() -> None:
 
 def test_a_fit_of_noisy_pairs_is_the_one_of_scipy_and_nothing_near_it_is_better() -> None:
     rng = default_rng(3)
-    source, target, weights = rng.normal(size=(20, 3)), rng.normal(size=(20, 3)), rng.random(20)
+    source = rng.normal(size=(20, 3))
+    target = rng.normal(size=(20, 3))
+    weights = rng.random(20)
     found = fit_rigid(source, target, weights)
     middle, aim = (np.average(points, axis=0, weights=weights) for points in (source, target))
     expected = Rotation.align_vectors(target - aim, source - middle, weights=weights)[0].as_matrix()

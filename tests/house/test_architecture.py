@@ -49,6 +49,7 @@ def test_tests_lie_in_the_rooms_they_test(tmp_path: Path) -> None:
 def test_every_package_keeps_the_rules_of_names(name: str) -> None:
     package = read_package(TOP / "src" / name)
     assert rules.banned_names(package) + rules.long_signatures(package) + cycles(package) == []
+    assert rules.joined_assignments(package) == []
 
 
 def test_the_house_keeps_its_budget(tmp_path: Path) -> None:
@@ -101,7 +102,8 @@ def package_of(folder: Path, files: dict[str, str]) -> Package:
     return read_package(root)
 
 
-MESH, LATER = "geometry/mesh.py", {"io/readers.py": "", "io/formats/ply.py": ""}
+MESH = "geometry/mesh.py"
+LATER = {"io/readers.py": "", "io/formats/ply.py": ""}
 READERS, ROOT = "imports io.readers, a later room", "imports __init__, the root, which lies above all rooms"
 TORCH = f"imports torch, which only {', '.join(rules.MAY_IMPORT['torch'])} may"
 OBJECTS = f"imports mereo_objects, which only {', '.join(SATELLITES['mereo_objects'])} may"
@@ -139,6 +141,8 @@ FAULTS = [
     (rules.banned_names, {MESH: "def f(x):\n    raise FileNotFoundError(x.own_data)\nbone = owner = phone = 1"}, []),
     (rules.long_signatures, {MESH: "def more(a, b, c, d, e, f, *, g, h): pass"}, [f"{MESH}:1 more has 8 parameters"]),
     (rules.long_signatures, {MESH: "class A:\n    def most(self, a, b, c, d, e, f, g): pass"}, []),
+    (rules.joined_assignments, {MESH: "a, b = f(c), 1"}, [f"{MESH}:1 assigns what is unlike"]),
+    (rules.joined_assignments, {MESH: "a, b = f(c), f(d)\na, b = b, a.c\na.b, c = 1, d\na, b = *c, 1"}, []),
 ]
 
 

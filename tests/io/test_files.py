@@ -91,7 +91,8 @@ def npy(array: ndarray) -> bytes:
     return file.getvalue()
 
 
-PLY, PCD = save_ply(POINTS, "binary_little_endian"), save_pcd(POINTS, "binary")
+PLY = save_ply(POINTS, "binary_little_endian")
+PCD = save_pcd(POINTS, "binary")
 PACKED = struct.pack("<II", 5, 80) + bytes([1, 65, 66, 32, 10])
 BAD_CLOUDS = {
     "empty.ply": (b"", "is empty"),
@@ -152,7 +153,8 @@ def test_missing_files_and_directories(tmp_path: Path) -> None:
 
 def test_parts_of_an_obj_keep_their_order_names_and_closedness(tmp_path: Path) -> None:
     box = trimesh.creation.box()
-    lines, offset = [], 1
+    lines = []
+    offset = 1
     for name, shift in (("zebra", 0.0), ("ant", 3.0), ("middle part", 6.0)):
         lines += [f"v {x + shift} {y} {z}" for x, y, z in box.vertices]
         start = -8 if name == "ant" else offset  # those below 0 count from the latest vertex
@@ -222,7 +224,8 @@ def write_glb(path: Path, arrays: list[ndarray], **tree: Any) -> Path:
 
 
 BOX = trimesh.creation.box()
-CORNERS, SIDES = BOX.vertices.astype("<f4"), BOX.faces.reshape(-1).astype("<u2")
+CORNERS = BOX.vertices.astype("<f4")
+SIDES = BOX.faces.reshape(-1).astype("<u2")
 SOLID = {"attributes": {"POSITION": 0}, "indices": 1}
 
 
@@ -430,7 +433,8 @@ def test_soft_edges_are_taken_from_half_of_white_and_a_word_is_said(tmp_path: Pa
 
 
 def test_a_mask_of_ids_needs_the_objects(tmp_path: Path) -> None:
-    ids, path = disk(1, 4, 3), tmp_path / "ids.png"
+    ids = disk(1, 4, 3)
+    path = tmp_path / "ids.png"
     save_depth(path, ids)
     palette = Image.fromarray(ids)
     palette.putpalette([0, 0, 0, 128, 0, 0, 0, 128, 0, 128, 128, 0, 0, 0, 128])
@@ -453,7 +457,8 @@ def test_a_mask_of_ids_needs_the_objects(tmp_path: Path) -> None:
 
 
 def test_what_is_opaque_is_the_object(tmp_path: Path) -> None:
-    truth, noise = disk(255) > 0, default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
+    truth = disk(255) > 0
+    noise = default_rng(3).integers(0, 256, (40, 60, 3)).astype(np.uint8)
     alpha = Image.fromarray(truth.astype(np.uint8) * 250)
     for name, image in (
         ("colors", Image.merge("RGBA", (*Image.fromarray(noise).split(), alpha))),

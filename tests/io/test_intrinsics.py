@@ -120,7 +120,8 @@ MANY = {
 @pytest.mark.parametrize("name", MANY)
 def test_the_frame_is_chosen_by_the_images_name_or_by_its_index(tmp_path: Path, name: str) -> None:
     content, first, second, index = MANY[name]
-    path, size = tmp_path / name, (640, 480)
+    path = tmp_path / name
+    size = (640, 480)
     path.write_text(json.dumps(content))
     assert read_intrinsics(path, size, first).camera == Camera(640, 480, 525.0, 520.0, 320.0, 240.0)
     assert read_intrinsics(path, size, second).camera.focal_x_px == 600.0

@@ -44,7 +44,9 @@ def connect(monkeypatch: pytest.MonkeyPatch) -> Any:
     """Connect cameras that deliver these and raise what is an error; after that they are silent."""
 
     def connected(*delivered: Any, serials: Names = (SERIAL, "12")) -> MagicMock:
-        sdk, waiting, plugged = MagicMock(), list(delivered), list(serials)
+        sdk = MagicMock()
+        waiting = list(delivered)
+        plugged = list(serials)
 
         def wait(_: int) -> tuple[bool, Any]:
             frame = waiting.pop(0) if waiting else None

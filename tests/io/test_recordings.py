@@ -50,7 +50,8 @@ def test_the_depth_topic_is_found_and_read(tmp_path: Path, name: str, ros: int) 
 
 def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_frames(tmp_path: Path) -> None:
     path = write_bag(tmp_path / "a.bag", 1, depth_topics)
-    whole, sentences = path.read_bytes(), set()
+    whole = path.read_bytes()
+    sentences = set()
     for start in range(4096, len(whole), 131):
         path.write_bytes(whole[:start] + b"\xff" * 60 + whole[start + 60 :])
         try:
@@ -64,7 +65,8 @@ def test_a_recording_that_is_damaged_anywhere_is_a_sentence_after_its_whole_fram
 
 def test_the_unit_is_that_which_the_sdk_of_a_realsense_records(tmp_path: Path) -> None:
     def topics(make: Messages) -> Topics:
-        depth, unit = make.image(DEPTH_MM[0], "16UC1"), make.types["std_msgs/msg/String"](data="0.000100")
+        depth = make.image(DEPTH_MM[0], "16UC1")
+        unit = make.types["std_msgs/msg/String"](data="0.000100")
         return {"/a/Depth_0": [depth], "/b": [make.info()], "/a/option/Depth_Units/value": [unit]}
 
     assert_allclose(depth_in(write_bag(tmp_path / "a.mcap", 2, topics)).depth, DEPTH_MM[0] / 10_000)

@@ -25,7 +25,8 @@ BOX = np.stack([CENTER - SIDES / 2, CENTER + SIDES / 2])
 
 @pytest.mark.parametrize("write", [write_segments_glb, meshes.write_segments_obj])
 def test_a_file_keeps_names_colours_and_vertices(write: Callable[[Path, SegmentedMesh], None], tmp_path: Path) -> None:
-    mesh, path = segments(), tmp_path / ("s.glb" if write is write_segments_glb else "s.obj")
+    mesh = segments()
+    path = tmp_path / ("s.glb" if write is write_segments_glb else "s.obj")
     write(path, mesh)
     back = read_segmented_mesh(path)
     assert back.names == ("zebra head", "Öhrchen")

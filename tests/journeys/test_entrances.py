@@ -164,7 +164,8 @@ def test_the_table_of_distances_follows_the_formulas() -> None:
     rows = re.findall(row, CAMERAS.read_text(), re.M)
     assert len(rows) == 6
     for z, *stated in np.array(rows, float).tolist():
-        at, angles = np.full(2, z), np.deg2rad([0.0, 60.0])
+        at = np.full(2, z)
+        angles = np.deg2rad([0.0, 60.0])
         light, flight = (1e3 * axial_std_m(at, angles, model) for model in MODELS)
         assert stated[:5] == pytest.approx((*light, 1e3 * z**2 / KINECT_DISPARITY_M, *flight), abs=0.0051)
         assert stated[5:] == [round(0.1 * focal / z) for focal in (420, 525)]

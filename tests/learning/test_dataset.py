@@ -58,14 +58,16 @@ def test_the_size_of_what_is_seen_is_known_where_the_unit_is(tmp_path: Path) -> 
 def observed(generator: Generator, points: int, queries: int) -> dict[str, np.ndarray]:
     """Half balls, and three halves of their cloud, of which the last has fewer points."""
     row = half_balls(generator, points, queries)
-    cloud, half = row["cloud"], points // 2
+    cloud = row["cloud"]
+    half = points // 2
     parts = [cloud[:half], cloud[-half:], cloud[10:40]]
     seen = np.stack([part[np.arange(points) % len(part)] for part in parts]).astype(np.float16)
     return row | {"seen": seen, "seen_count": np.array([len(part) for part in parts], np.int32)}
 
 
 def test_without_augmentation_a_batch_is_the_stored_data(data: Dataset) -> None:
-    batch, stored = data.batch(torch.arange(4), 96, 0, NONE, Draws.of(0)), data.read(torch.arange(4))
+    batch = data.batch(torch.arange(4), 96, 0, NONE, Draws.of(0))
+    stored = data.read(torch.arange(4))
     assert torch.allclose(batch.cloud, stored["cloud"], atol=1e-5)
     assert torch.allclose(batch.positions, stored["positions"], atol=1e-5)
     viewpoint = -stored["center"] * stored["scale"][:, None]
@@ -99,7 +101,8 @@ def test_a_share_of_a_batch_meets_the_changes_of_the_whole(data: Dataset) -> Non
 
 def test_query_subset_keeps_labels_with_positions(data: Dataset) -> None:
     index = torch.tensor([2, 5])
-    batch, stored = data.batch(index, 96, 16, NONE, Draws.of(0)), data.read(index)
+    batch = data.batch(index, 96, 16, NONE, Draws.of(0))
+    stored = data.read(index)
     assert batch.positions.shape == (2, 16, 3)
     match = torch.cdist(batch.positions, stored["positions"]).argmin(dim=2)
     assert torch.equal(stored["labels"].long().gather(1, match), batch.labels)

@@ -73,7 +73,8 @@ def test_truth_grid_against_point_by_point() -> None:
     assert_allclose(truth.grid.positions(index), points)
     kept = np.zeros(len(points), bool)
     for segment in mesh.segments:
-        center, size = segment.bounds.mean(axis=0), np.ptp(segment.bounds, axis=0)
+        center = segment.bounds.mean(axis=0)
+        size = np.ptp(segment.bounds, axis=0)
         kept |= (np.abs(points - center) <= 0.75 * size).all(axis=1)
     assert_array_equal(truth.kept.ravel(), kept)
     assert (truth.grid.labels.ravel() == Solids(mesh).label(points)).mean() > 0.999
@@ -82,7 +83,8 @@ def test_truth_grid_against_point_by_point() -> None:
 
 def test_one_confusion_matrix_over_the_whole_set() -> None:
     """Not the mean over examples: a hard case weighs by its points."""
-    mesh, truth = two_cuboids(), truth_grid(two_cuboids(), 20)
+    mesh = two_cuboids()
+    truth = truth_grid(two_cuboids(), 20)
     models = [oracle(mesh), oracle(mesh, (0.25, 0.0, 0.0))]
     alone = [grid_confusion(truth, predict_grid(model, cloud(), truth), 2) for model in models]
 
@@ -93,7 +95,8 @@ def test_one_confusion_matrix_over_the_whole_set() -> None:
     # truth moved by 0.25 against the fixed oracle is the mirror image of the oracle moved
     result = score_cases(models[0], case, 2, progress=False)
     assert result.confusion.sum() == alone[0].sum() + alone[1].sum()
-    whole, each = result.scores, [scores.miou for scores in result.examples.values()]
+    whole = result.scores
+    each = [scores.miou for scores in result.examples.values()]
     assert each[0] == 1.0 and each[1] < 0.8
     assert whole.miou != pytest.approx(np.mean(each), abs=1e-3)
     assert result.example_mean[1] == pytest.approx(np.mean(each))
@@ -105,7 +108,8 @@ def test_pictures_show_what_lies_beside_the_box_of_the_truth() -> None:
     truth = truth_grid(mesh, 20)
     shift = 2.0 * truth.grid.spacing[0]
     result = score_cases(oracle(mesh, (shift, 0.0, 0.0)), lambda _: TestCase("0", cloud(), truth), 1, progress=False)
-    shown, inner = result.views[0], (slice(PICTURE_MARGIN, -PICTURE_MARGIN),) * 3
+    shown = result.views[0]
+    inner = (slice(PICTURE_MARGIN, -PICTURE_MARGIN),) * 3
     assert_array_equal(shown.reference[inner], truth.grid.labels)
     assert (shown.reference > 0).sum() == (truth.grid.labels > 0).sum()
     assert_allclose(shown.origin + PICTURE_MARGIN * shown.spacing, truth.grid.origin)
@@ -179,7 +183,8 @@ def test_written_results(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 
 
 def test_a_shipped_view_shows_its_truth(tmp_path: Path) -> None:
-    view, stored = load_view("rope"), np.load(SHIPPED / "rope.npz")
+    view = load_view("rope")
+    stored = np.load(SHIPPED / "rope.npz")
     assert_allclose(view.depth.depth, stored["depth"] * 0.005)
     assert (view.scene, view.seed, view.unit_m) == ("rope", 1_000_000, None)
     grid, points = view.truth.grid, view.depth.to_points().points

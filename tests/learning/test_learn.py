@@ -111,7 +111,8 @@ def test_what_hardly_deforms_is_said(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(check, "STATES", 3)
-    path, meshes = write_bar(tmp_path), [tmp_path / "left.stl", tmp_path / "right.stl"]
+    path = write_bar(tmp_path)
+    meshes = [tmp_path / "left.stl", tmp_path / "right.stl"]
     meshes[1].write_bytes(meshes[0].read_bytes())
     for files, message in (
         ([path], r"bar.yaml --repair` try, and learn .*bar-repaired.yaml"),
@@ -124,7 +125,8 @@ def test_a_faulty_object_is_refused_with_what_may_mend_it(tmp_path: Path, monkey
 
 
 def test_arguments_bind_once_something_is_made_of_them(tmp_path: Path) -> None:
-    scene, out = write_bar(tmp_path), tmp_path / "out"
+    scene = write_bar(tmp_path)
+    out = tmp_path / "out"
     with pytest.raises(FileNotFoundError, match="there are no weights 'bunnny'"):
         learn([scene], out, LearnConfig(init="bunnny"))
     assert not out.exists()
@@ -198,7 +200,8 @@ def small(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFact
 def test_one_command_and_the_same_again(
     small: None, tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scene, out = write_bar(tmp_path), tmp_path / "out"
+    scene = write_bar(tmp_path)
+    out = tmp_path / "out"
     config = LearnConfig(minutes=0.05, init="rope", train="always")
     scores = learn([scene], out, config)
     printed = capsys.readouterr()
@@ -240,7 +243,9 @@ def test_the_nearest_weights_are_those_that_adapt_fastest(
 
 @pytest.mark.slow
 def test_killed_at_any_stage_it_ends_with_the_same_weights(small: None, tmp_path: Path) -> None:
-    scene, whole, parts = write_bar(tmp_path), tmp_path / "whole", tmp_path / "parts"
+    scene = write_bar(tmp_path)
+    whole = tmp_path / "whole"
+    parts = tmp_path / "parts"
     config = LearnConfig(minutes=0.05, init="rope", train="always")
     learn([scene], whole, config)
     stages = "search_scores measure generate save evaluate_weights scores_of_views write_example_frame"
@@ -353,7 +358,8 @@ def test_the_scores_decide_whether_anything_is_trained(
     scored: list[SearchScores], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 ) -> None:
     monkeypatch.setattr(learning, "_train", Mock(side_effect=InterruptedError))
-    scene, out = write_bar(tmp_path), tmp_path / "out"
+    scene = write_bar(tmp_path)
+    out = tmp_path / "out"
     metrics = learn([scene], out)
     said = capsys.readouterr().out
     assert metrics["method"] == "search" and not metrics["trained"] and metrics["miou"] == 0.95
@@ -377,7 +383,8 @@ def test_the_scores_decide_whether_anything_is_trained(
 
 
 def test_what_is_begun_with_other_words_is_refused(scored: list[SearchScores], tmp_path: Path) -> None:
-    scene, out = write_bar(tmp_path), tmp_path / "out"
+    scene = write_bar(tmp_path)
+    out = tmp_path / "out"
     learn([scene], out)
     (out / "plan.json").write_text("{}")
     with pytest.raises(ValueError, match=r"was trained, or begun to be, but --train is never: leave it out"):
@@ -393,7 +400,8 @@ def test_what_is_begun_with_other_words_is_refused(scored: list[SearchScores], t
 
 
 def test_a_folder_knows_its_scene(scored: list[SearchScores], tmp_path: Path) -> None:
-    scene, out = write_bar(tmp_path), tmp_path / "out"
+    scene = write_bar(tmp_path)
+    out = tmp_path / "out"
     learn([scene], out)
     assert scene_of_folder(out) == str(scene) and scene_of_folder(tmp_path) is None
     content = read_json(out / "search.json")
@@ -403,10 +411,12 @@ def test_a_folder_knows_its_scene(scored: list[SearchScores], tmp_path: Path) ->
 
 
 def test_a_folder_is_an_object(small: None, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    out, meshes = tmp_path / "out", [str(path) for path in write_angle(tmp_path)]
+    out = tmp_path / "out"
+    meshes = [str(path) for path in write_angle(tmp_path)]
     command = ["learn", *meshes, "--units", "mm", "--train", "never", "--output", str(out)]
     assert command_line.main(command) == 0
-    said, scores = capsys.readouterr().out, (out / "search.json").read_bytes()
+    said = capsys.readouterr().out
+    scores = (out / "search.json").read_bytes()
     assert re.findall(r"\[(\d)/6\]", said) == ["1", "2"]
     assert "1 test views, which training has not seen" in said and "nothing is trained" in said
     assert f"--object {out} --output" in said

@@ -173,7 +173,8 @@ def learnt(norm: nn.Module, rows: Tensor, gradient: Tensor) -> list[Tensor]:
 def test_it_is_torchs_and_no_less_exact(spreads: float) -> None:
     rng = torch.Generator().manual_seed(0)
     rows = torch.randn(384, 8, generator=rng) + spreads * torch.randn(8, generator=rng)
-    gradient, weight = torch.randn(384, 8, generator=rng), torch.rand(8, generator=rng) + 0.5
+    gradient = torch.randn(384, 8, generator=rng)
+    weight = torch.rand(8, generator=rng) + 0.5
 
     def norm(dtype: torch.dtype, shared: bool) -> nn.Module:
         made = nn.BatchNorm1d(8, dtype=dtype)
@@ -189,7 +190,8 @@ def test_it_is_torchs_and_no_less_exact(spreads: float) -> None:
 
 @pytest.mark.usefixtures("group")
 def test_in_use_it_has_its_running_statistics_and_one_process_keeps_torchs() -> None:
-    norm, rows = nn.BatchNorm1d(4), torch.rand(16, 4)
+    norm = nn.BatchNorm1d(4)
+    rows = torch.rand(16, 4)
     shared = share_statistics(nn.Sequential(norm), Process(0, 2), CPU).eval()
     assert isinstance(norm, SharedBatchNorm) and norm.num_batches_tracked == 0
     assert torch.allclose(shared(rows), rows / (1 + norm.eps) ** 0.5)

@@ -42,7 +42,8 @@ from mereo_learning.scans import (
 from mereo_learning.scoring import EvaluationConfig, evaluate
 from mereo_objects.bunny import model_to_scene
 
-CAMERA, NOISE = Camera.from_fov(160, 160, float(np.deg2rad(30.0))), 0.02
+CAMERA = Camera.from_fov(160, 160, float(np.deg2rad(30.0)))
+NOISE = 0.02
 Bar, Require = tuple[Path, Scene, ndarray], Callable[[str], Path]
 
 
@@ -56,7 +57,8 @@ def true_poses() -> ndarray:
     """In a camera frame: three sides of base and arm are seen; the arm is bent away by 25 degrees."""
     turn = Rotation.from_euler("yx", [-35, 25], degrees=True).as_matrix()
     whole = rigid(turn, np.array([-8.0, -2.0, 110.0]))
-    bend, joint = Rotation.from_rotvec(np.deg2rad(25) * np.array([0.1, 0.3, 1.0])).as_matrix(), np.array([20.5, 6, 4])
+    bend = Rotation.from_rotvec(np.deg2rad(25) * np.array([0.1, 0.3, 1.0])).as_matrix()
+    joint = np.array([20.5, 6, 4])
     return np.stack([whole, whole @ rigid(bend, joint - bend @ joint), whole])
 
 
@@ -70,7 +72,8 @@ def perturbed(pose: ndarray, middle: ndarray, degrees: float, shift: float, seed
     """``pose``, then a turn about ``middle`` (model coordinates) and a shift, both in a random direction."""
     rng = default_rng(seed)
     axis, way = (vector / norm(vector) for vector in rng.normal(size=(2, 3)))
-    turn, place = Rotation.from_rotvec(np.deg2rad(degrees) * axis).as_matrix(), transform_points(pose, middle)
+    turn = Rotation.from_rotvec(np.deg2rad(degrees) * axis).as_matrix()
+    place = transform_points(pose, middle)
     return rigid(turn, place - turn @ place + shift * way) @ pose
 
 
@@ -127,7 +130,8 @@ def test_each_segment_comes_to_its_own_true_pose_and_a_hidden_one_goes_with_its_
 
 @pytest.mark.slow
 def test_a_held_segment_is_left_to_its_neighbour_or_start(points: ndarray) -> None:
-    rest, rough = object_at_rest(), start()
+    rest = object_at_rest()
+    rough = start()
     own = place(rest, points, rough, hold=["arm"]).segments[1]
     assert own.placed_by == "start"
     assert_array_equal(own.T_scan_segment, rough.poses[1])
@@ -164,7 +168,8 @@ def test_a_scan_of_something_else_or_far_from_the_start_is_refused(points: ndarr
 def test_a_segment_that_ran_away_is_refused() -> None:
     before, after = true_poses(), true_poses()
     after[2, :3, 3] += 4.0  # the peg is 5.6 long
-    matches, scan = Matches(np.zeros(1, int), np.zeros(1), 1.0), Scan(np.zeros((1, 3)), np.zeros(3), 44.0, 1.0)
+    matches = Matches(np.zeros(1, int), np.zeros(1), 1.0)
+    scan = Scan(np.zeros((1, 3)), np.zeros(3), 44.0, 1.0)
     with pytest.raises(ValueError, match="segment 'peg' moved by 6.93 .* at most 5.59, .* --hold peg"):
         _check(object_at_rest(), before, Registration(after, np.ones(3, bool), np.zeros(3, int), matches), scan)
     after[2, :3, 3] -= 2.0
@@ -229,7 +234,8 @@ def test_exact_pairs_and_matrices_give_the_pose_and_a_segment_may_have_its_own(t
 
 def test_the_known_scale_is_kept_and_the_middle_stays_and_a_missing_file_is_named(tmp_path: Path) -> None:
     """A matrix of a scale that is 5 % off: size from the units, place and turn from the matrix."""
-    rest, rough = object_at_rest(), rigid(1.05 * SCALE * TURN, np.array([1.0, 2.0, 3.0]))
+    rest = object_at_rest()
+    rough = rigid(1.05 * SCALE * TURN, np.array([1.0, 2.0, 3.0]))
     pose = read_start(write(tmp_path, {"object": rough.tolist()}), rest, SCALE).poses[0]
     assert_allclose(pose[:3, :3], SCALE * TURN, atol=1e-9)
     middle = rest.bounds.mean(axis=0)

@@ -130,7 +130,8 @@ def test_every_loss_variant_trains_and_answers(dataset: Path, tmp_path: Path, lo
 
 
 def test_training_starts_from_given_weights(dataset: Path, first: Path, tmp_path: Path) -> None:
-    data, config = Dataset.load(dataset), replace(SMALL, init=str(first))
+    data = Dataset.load(dataset)
+    config = replace(SMALL, init=str(first))
     other_counts = config.network.changed(points=48, neighbors=6)  # the same weights fit
     for settings in (config.network, other_counts):
         network = start_network(replace(config, network=settings), data)
@@ -162,7 +163,8 @@ def test_training_starts_from_another_objects_weights(dataset: Path, first: Path
 
 def test_only_the_first_process_claims_a_folder(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A process that comes while the first one writes the settings waits instead of refusing the directory."""
-    data, waited = Dataset.load(dataset), []
+    data = Dataset.load(dataset)
+    waited = []
     with pytest.raises(ValueError, match="batch of 8 cannot be shared by 3 processes"):
         claim_run(tmp_path / "run", SMALL, data, trainer.Process(0, 3))
     monkeypatch.setattr(torch.distributed, "get_backend", lambda: "gloo")

@@ -82,7 +82,8 @@ def things() -> list[Segment]:
     table.apply_transform(rigid(SLOPE.as_matrix(), on_desk(0.0, -0.01, 0.0)))
     wall = trimesh.creation.box((6.0, 6.0, 0.02))
     wall.apply_translation([0.0, 0.0, 1.6])
-    ball, can = trimesh.creation.icosphere(3, 0.03), trimesh.creation.cylinder(0.025, 0.1)
+    ball = trimesh.creation.icosphere(3, 0.03)
+    can = trimesh.creation.cylinder(0.025, 0.1)
     box = trimesh.creation.box((0.08, 0.05, 0.06))
     for thing, place in ((ball, (0.12, 0.03, 0.0)), (can, (-0.16, 0.025, 0.08)), (box, (0.05, 0.025, 0.2))):
         thing.apply_transform(rigid(SLOPE.as_matrix(), on_desk(*place)))
@@ -398,7 +399,9 @@ def test_what_an_occluder_hides_of_the_outline_does_not_count(image: DepthImage,
 def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
     placed: SegmentedMesh, std: float, level: float
 ) -> None:
-    clean, depth, rng = desk(*placed.segments), render_depth(placed, CAMERA).depth, default_rng(1)
+    clean = desk(*placed.segments)
+    depth = render_depth(placed, CAMERA).depth
+    rng = default_rng(1)
     field = gaussian_filter(rng.normal(size=depth.shape), 8)
     shared = np.where(clean.valid, clean.depth + level * clean.depth * field / field.std(), 0.0)
     noisy = add_depth_noise(DepthImage(shared, clean.camera), std, rng)

@@ -58,12 +58,14 @@ def ball_pair(rng: Generator, points: int, queries: int) -> dict[str, ndarray]:
     cloud = centers[which] + radii[which, None] * front
     places = rng.uniform([-1.4, -1.4, 18.6], [1.4 + 2 * radii[1], 1.4, 21.4], size=(queries, 3))
     to_center = centers - places[:, None]
-    reach, rows = norm(to_center, axis=2), np.arange(queries)
+    reach = norm(to_center, axis=2)
+    rows = np.arange(queries)
     nearest = (reach - radii).argmin(axis=1)
     distance = (reach - radii)[rows, nearest]
     outward = np.where(distance < 0, -1, 1)[:, None]
     directions = outward * (to_center / reach[..., None])[rows, nearest]
-    labels, rest = np.where(distance < 0, nearest + 1, 0), np.full((queries, 3), np.nan)
+    labels = np.where(distance < 0, nearest + 1, 0)
+    rest = np.full((queries, 3), np.nan)
     return example_of(cloud, places, labels=labels, distances=distance, directions=directions, rest=rest)
 
 
@@ -104,7 +106,8 @@ def truth(dataset: Path, number: int) -> SegmentedMesh:
 
 def test_a_code_found_from_the_cloud_explains_the_shape(run: Path, model: Model, data: Dataset) -> None:
     """From the visible half alone: far better than the mean code, short of the code trained with the whole shape."""
-    network, stored = model.network, read_all(data)
+    network = model.network
+    stored = read_all(data)
     latents = load_file(run / "checkpoint.safetensors")["network/encoder.codes"]
     encodings = (Encoding(latent, ()) for latent in (latents, latents.mean(dim=0).repeat(len(data), 1)))
     codes = [network.decoder.prepare(encoding, stored.cloud, stored.viewpoint) for encoding in encodings]
@@ -116,7 +119,8 @@ def test_a_code_found_from_the_cloud_explains_the_shape(run: Path, model: Model,
 
 
 def test_the_search_is_deterministic_and_by_cloud(model: Model, data: Dataset) -> None:
-    network, stored = model.network, read_all(data)
+    network = model.network
+    stored = read_all(data)
     together = network.encode(stored.cloud, stored.viewpoint).latent1
     with torch.inference_mode():
         again = network.encode(stored.cloud.clone(), stored.viewpoint.clone()).latent1

@@ -151,7 +151,8 @@ def threads() -> Iterator[None]:
 @pytest.mark.usefixtures("threads")
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_answers_are_the_same_bits_in_any_number_of_threads(precision: Precision) -> None:
-    model, view = replace(load_model("bunny"), precision=precision), load_view("bunny")
+    model = replace(load_model("bunny"), precision=precision)
+    view = load_view("bunny")
     code = model.encode(view.depth.to_points())
     points = default_rng(0).normal(size=(3 * CPU_QUERY_CHUNK + 7, 3)) * 8 + view.depth.to_points().points[0]
     torch.set_num_threads(1)
@@ -199,9 +200,11 @@ def test_a_forked_process_has_threads_of_its_own_and_computes() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 @pytest.mark.parametrize("name", ["bunny", "rope"])
 def test_cuda_answers_as_the_cpu(name: str) -> None:
-    exact, view = load_model(name), load_view(name)
+    exact = load_model(name)
+    view = load_view(name)
     fast = replace(load_model(name, "cuda"), precision="float32")
-    points, cloud = random_points(view, 900), view.depth.to_points()
+    points = random_points(view, 900)
+    cloud = view.depth.to_points()
     expected, answer = (model.query(model.encode(cloud), points) for model in (exact, fast))
     assert (answer.label != expected.label).mean() < 0.01
     assert abs(answer.distance - expected.distance).mean() < 0.01 * (points.max() - points.min())

@@ -252,7 +252,9 @@ runpy.run_path("mereo_onnx.py", run_name="__main__")
 def test_the_runner_answers_as_the_model_without_torch(exported: Exported) -> None:
     model, folder = exported
     cloud = raw_cloud(3000)
-    low, high, size = cloud.min(axis=0), cloud.max(axis=0), np.ptp(cloud, axis=0).max()
+    low = cloud.min(axis=0)
+    high = cloud.max(axis=0)
+    size = np.ptp(cloud, axis=0).max()
     queries = default_rng(2).uniform(low - 0.3 * size, high + 0.3 * size, (20_000, 3))
     np.save(folder / "frame.npy", cloud)
     np.save(folder / "queries.npy", queries)

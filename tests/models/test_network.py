@@ -93,7 +93,8 @@ def test_what_all_clouds_have_in_common_is_not_rounded_to_bfloat16() -> None:
 def test_split_latent_layer_equals_concatenation() -> None:
     """W [z; x] = W_z z + W_x x: the paper's concatenated query vector, without building it."""
     network = settled(TINY.changed(local_neighbors=0, sight_neighbors=0, align_points=0))
-    decoder, cloud = network.decoder, cloud_of(TINY)
+    decoder = network.decoder
+    cloud = cloud_of(TINY)
     points = torch.randn(2, 9, 3)
     with torch.inference_mode():
         latent = network.encoder(cloud).latent
@@ -125,7 +126,8 @@ def test_dropout_clears_its_share_and_only_in_training() -> None:
     plain = NetworkConfig().changed(points=64, width=512, depth=1, skip_after=1, mlp_global=(8,))
     networks = [settled(plain.changed(dropout=share)) for share in (0.0, 0.2)]
     networks[1].load_state_dict(networks[0].state_dict())
-    queries, seen = torch.randn(2, 40, 3), []
+    queries = torch.randn(2, 40, 3)
+    seen = []
     for network in networks:
         network.decoder.head.register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0].detach()))
         for is_training in (False, True):
@@ -255,7 +257,8 @@ def test_vector_attention_is_equation_3() -> None:
 
 
 def test_encoder_ignores_which_points_fill_up_a_cloud_and_the_order_of_what_is_not_kept() -> None:
-    encoder, cloud = settled(TRANSFORMER).encoder, cloud_of(TRANSFORMER)
+    encoder = settled(TRANSFORMER).encoder
+    cloud = cloud_of(TRANSFORMER)
     front, again = cloud[:, :80], torch.randperm(80, generator=torch.Generator().manual_seed(2))[:48]
     first = TRANSFORMER.points // 4
     order = torch.randperm(TRANSFORMER.points - first, generator=torch.Generator().manual_seed(2))
@@ -353,7 +356,8 @@ def test_what_is_read_corrects_the_coordinates() -> None:
 
 @pytest.mark.slow
 def test_a_missing_template_is_made_on_resume(tmp_path: Path) -> None:
-    scene, settings = toy_scene(), GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
+    scene = toy_scene()
+    settings = GenerateConfig(image_size=48, points=64, sampling=SamplingConfig(per_segment=8))
     for resume in (False, True):
         generate(scene, tmp_path / "data", settings, examples=2, seed=3, resume=resume)
         template = Dataset.load(tmp_path / "data").template

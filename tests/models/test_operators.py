@@ -56,7 +56,8 @@ def test_squared_distances_keep_digits_far_from_the_origin_and_gather_equals_ind
     a = torch.tensor([[[1000.0, 0.0, 0.0]]])
     b = torch.tensor([[[1000.0, 0.01, 0.0]]])
     assert torch.allclose(squared_distances(a, b), torch.tensor([[[1e-4]]]), rtol=1e-3)
-    values, index = random_points(3, 20), torch.randint(0, 20, (3, 5, 4), generator=torch.Generator().manual_seed(1))
+    values = random_points(3, 20)
+    index = torch.randint(0, 20, (3, 5, 4), generator=torch.Generator().manual_seed(1))
     expected = torch.stack([values[b][index[b]] for b in range(3)])
     assert torch.equal(gather(values, index), expected)
 
@@ -136,7 +137,8 @@ def random_motion(batch: int, seed: int = 0) -> Alignment:
 @pytest.mark.parametrize("flatten", [1.0, 0.0])
 def test_fit_finds_the_motion_that_was_made(flatten: float) -> None:
     """Also of flat clouds, whose mirror image is as near; in bfloat16 coordinates stay what they are."""
-    motion, cloud = random_motion(8), random_points(8, 50, 1) * torch.tensor([1.0, 1.0, flatten])
+    motion = random_motion(8)
+    cloud = random_points(8, 50, 1) * torch.tensor([1.0, 1.0, flatten])
     moved = motion.apply(cloud)
     found = fit_rigid(cloud, moved)
     assert torch.allclose(found.rotation, motion.rotation, atol=1e-5)

@@ -22,7 +22,8 @@ from mereo.models.weights import load_model, save_model, trained_steps, weights_
 from mereo.models.weights_place import NOT_SHIPPED, find_weights, shipped_names
 from mereo_learning.learn import learn
 
-WITH_STATES, BIAS = find_weights("rope"), "decoder.head.bias"
+WITH_STATES = find_weights("rope")
+BIAS = "decoder.head.bias"
 
 
 Change = Callable[[Any, dict[str, torch.Tensor]], Any]
@@ -34,7 +35,8 @@ def changed(folder: Path, change: Change, with_states: bool = False) -> Path:
     path = folder / "changed.safetensors"
     path.write_bytes(WITH_STATES.read_bytes() if with_states else weights_bytes(untrained(("a", "b"))))
     with safe_open(path, "pt") as file:
-        header, tensors = json.loads(file.metadata()["mereo"]), load_file(path)
+        header = json.loads(file.metadata()["mereo"])
+        tensors = load_file(path)
     other = change(header, tensors)
     save_file(tensors, path, metadata={"mereo": json.dumps(header if other is None else other)})
     return path
@@ -102,7 +104,8 @@ def test_every_shipped_file_is_listed_with_the_scores_of_its_card(capsys: pytest
 
 
 def test_show_prints_the_unit_and_the_card_or_all_as_json(capsys: pytest.CaptureFixture) -> None:
-    text, tumor = said(capsys, "show", "tumor"), find_weights("tumor")
+    text = said(capsys, "show", "tumor")
+    tumor = find_weights("tumor")
     assert "8.134 mm to a scene unit" in text and tumor.with_suffix(".md").read_text("utf-8") in text
     assert sha256(tumor.read_bytes()).hexdigest() in text.split("# tumor")[0]
     facts = json.loads(said(capsys, "show", "bunny", "--json"))

@@ -91,7 +91,8 @@ LINKS = ("base", "column", "upper_arm", "elbow", "forearm", "wrist", "hand")
 
 @pytest.fixture(scope="module")
 def states() -> list[State]:
-    scene, rng = load_scene("robot"), default_rng(1)
+    scene = load_scene("robot")
+    rng = default_rng(1)
     return [scene.sample_state(rng) for _ in range(40)]
 
 
@@ -167,7 +168,8 @@ def extreme_pose(rng: Generator) -> tuple[ndarray, dict[str, ndarray]]:
 
 def neighbours(spine: ndarray, legs: dict[str, ndarray]) -> Iterator[tuple[Manifold, Manifold, ndarray, ndarray]]:
     """Every two links that share a knuckle, with their motions: the socket's first."""
-    links, motions = spine_links(), lizard.spine_motions(spine)
+    links = spine_links()
+    motions = lizard.spine_motions(spine)
     yield from zip(links[:-1], links[1:], motions[:-1], motions[1:], strict=True)
     for name, (plan, side, carrier) in lizard.LEGS.items():
         upper, foot = lizard._leg_motions(name, motions, legs[name])
@@ -186,7 +188,8 @@ def test_links_keep_clear_of_each_other_at_the_limits() -> None:
 
 def test_a_chain_of_knuckles_moves_every_link_rigidly() -> None:
     vectors, _ = extreme_pose(default_rng(2))
-    chain, motion = Hinged(SPINE, vectors), np.eye(4)
+    chain = Hinged(SPINE, vectors)
+    motion = np.eye(4)
     for number, link in enumerate(spine_links()):
         if number > 0:
             motion = follow(motion, SPINE[number - 1], vectors[number - 1])

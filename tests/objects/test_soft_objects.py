@@ -24,7 +24,8 @@ STATES = 100
 
 @pytest.fixture(scope="module")
 def states() -> list[SegmentedMesh]:
-    scene, rng = load_scene("rope"), default_rng(1)
+    scene = load_scene("rope")
+    rng = default_rng(1)
     return [scene.sample_state(rng).mesh for _ in range(STATES)]
 
 

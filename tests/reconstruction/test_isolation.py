@@ -35,7 +35,8 @@ def wall(count: int = 6000, z: float = 1.5) -> ndarray:
     return np.column_stack([x, y, z + 0.1 * x + default_rng(2).normal(0, 0.002, count)])
 
 
-BALL, WALL = half_ball(), wall()
+BALL = half_ball()
+WALL = wall()
 STRAYS = default_rng(3).uniform((-0.5, -0.5, 0.5), (0.5, 0.5, 1.2), (40, 3))
 EVERYTHING = np.concatenate([BALL, WALL, STRAYS])
 

@@ -89,7 +89,9 @@ def kinds(lines: SightLines, camera: Camera) -> ndarray:
 
 def occlude(view: View, kind: Cut, sensor: SensorConfig = SENSORS["paper"], wall: bool = True) -> Occluded:
     """The same state before a far wall, alone or behind the tool or hand that hides most."""
-    solids, camera, rng = Solids(view.mesh), view.depth.camera, default_rng(1)
+    solids = Solids(view.mesh)
+    camera = view.depth.camera
+    rng = default_rng(1)
     rays = camera.directions().reshape(-1, 3)
     backdrop = Backdrop(AWAY, farthest(solids, AWAY) + 60.0) if wall else None
     choices = [Surroundings((), backdrop)]

@@ -130,7 +130,8 @@ def test_a_surface_outside_does_not_tear(registrar: Registrar, bent: Registratio
     assert isinstance(placed.content, Surfaces) and (placed.distance > 0).all()
     # shares fall with the fourth power of the distance
     distance = np.stack([Solids(SCENE.rest).segment_distance(i, placed.content.points) for i in range(4)], axis=1)
-    relative, nearer = placed.shares / placed.shares.max(axis=1, keepdims=True), distance.min(axis=1, keepdims=True)
+    relative = placed.shares / placed.shares.max(axis=1, keepdims=True)
+    nearer = distance.min(axis=1, keepdims=True)
     assert_allclose(relative, (nearer / distance) ** 4, atol=2e-3)
     found, faces = carry(placed, bent).content.points, placed.content.mesh.segments[0].faces
     nearest = bent.to_camera(placed.content.points)
@@ -191,7 +192,8 @@ def test_built_in_scenes_say_how_their_files_lie_in_them(
 ) -> None:
     """Vertices of the source lie on the surface at rest, but for what the scene leaves out or moves."""
     require_asset("human/makehuman_default.mhskel" if scene == "human" else file)
-    loaded, mesh = load_scene(scene), read_segmented_mesh(require_asset(file))
+    loaded = load_scene(scene)
+    mesh = read_segmented_mesh(require_asset(file))
     own = mesh.segments[0].vertices if scene != "human" else mesh.segments[mesh.names.index("body")].vertices
     distance = Solids(loaded.rest).nearest(transform_points(loaded.T_scene_source, own)).distance
     assert np.median(distance) < 0.05, np.median(distance)
@@ -246,7 +248,8 @@ def test_what_names_the_other_space_is_turned(registrar: Registrar, other: str, 
 
 def test_a_space_that_no_file_names_is_stated_or_refused_where_the_other_fits(registrar: Registrar) -> None:
     mine, points = in_patient(registrar, None)
-    matrix, body = rigid(np.eye(3), np.array([-250.0, -150, -60])), np.zeros((100, 60, 40), np.int16)
+    matrix = rigid(np.eye(3), np.array([-250.0, -150, -60]))
+    body = np.zeros((100, 60, 40), np.int16)
     index = np.stack(np.meshgrid(*map(np.arange, body.shape), indexing="ij"), axis=-1).reshape(-1, 3)
     matrix[:3, :3] *= 5
     source = mine.model.source_frame.T_scene_source
@@ -514,7 +517,8 @@ def run(folder: Path, files: Names, *options: str, cloud: str = "cloud.npy", out
 def test_the_command_carries_in_the_frame_and_unit_of_its_other_files(folder: Path) -> None:
     options = ["--method", "modes", "--unit-m", "0.01", "--millimetres", "--formats", "ply", "glb", "json"]
     options += ["--carry-frame", "RAS"]  # as ct.nrrd comes out
-    files, out = ("own.ply", "own.glb", "grasp.csv", "ct.nrrd"), folder / "out"
+    files = ("own.ply", "own.glb", "grasp.csv", "ct.nrrd")
+    out = folder / "out"
     assert run(folder, files, *options) == 0
     summary = read_json(out / "summary.json")
     assert tuple(one["file"] for one in summary["carried"]) == files

@@ -58,7 +58,8 @@ def test_bad_clouds(case: str, tmp_path: Path, capsys: pytest.CaptureFixture) ->
 
 @pytest.mark.parametrize("number", ["1e400", "1e300", "nan"])
 def test_a_mesh_beyond_all_numbers(number: str, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    places, faces = f"v 0 0 0\nv {number} 0 0\nv 0 1 0\nv 0 0 1\n", "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+    places = f"v 0 0 0\nv {number} 0 0\nv 0 1 0\nv 0 0 1\n"
+    faces = "f 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
     (tmp_path / "part.obj").write_text(places + faces)
     text = "part.obj cannot be read as a mesh (its part 'part' has vertices that are NaN, infinite or beyond 1e+12)"
     refused(capsys, tmp_path, text, "learn", tmp_path / "part.obj", "--output", tmp_path / "out")

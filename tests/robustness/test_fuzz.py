@@ -172,7 +172,8 @@ def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.Capture
     name, change, expected = CASES[case]
     if name not in TARGETS:
         pytest.skip(f"nothing is installed that reads {name}")
-    target, path = TARGETS[name], tmp_path / name
+    target = TARGETS[name]
+    path = tmp_path / name
     target.write(path)
     path.write_bytes(change(path.read_bytes()))
     assert fault_of(target.read, path) == (expected is None, "")
@@ -183,7 +184,8 @@ def test_it_is_one_sentence_now(case: str, tmp_path: Path, capfd: pytest.Capture
 
 
 def test_a_checkpoint_of_another_run_is_refused_before_training_begins(tmp_path: Path) -> None:
-    target, path = TARGETS["checkpoint.safetensors"], tmp_path / "checkpoint.safetensors"
+    target = TARGETS["checkpoint.safetensors"]
+    path = tmp_path / "checkpoint.safetensors"
     target.write(path)
     whole = load_file(path)
     for name, size in (("optimizer/0/exp_avg", 7), ("optimizer/0", 1), ("network/x", 2)):

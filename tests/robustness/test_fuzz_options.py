@@ -39,7 +39,8 @@ VALUES = st.sampled_from(ODD) | st.text(max_size=8) | st.integers().map(str) | s
 @lru_cache
 def options(command: str) -> Names:
     """Names of a command's options, from its help."""
-    text, words = io.StringIO(), command.split(" missing")[0].split()
+    text = io.StringIO()
+    words = command.split(" missing")[0].split()
     with redirect_stdout(text), pytest.raises(SystemExit):
         run_mereo(*(words[:1] if words[0] == "experiment" else words), "--help")
     found = set(re.findall(r"--[a-z][a-z0-9.-]*[a-z0-9]", text.getvalue())) - {"--help"}
@@ -66,7 +67,8 @@ def test_odd_values_of_options_are_refused(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture,
 ) -> None:
-    folder, read_only = tmp_path_factory.mktemp("options"), command in ONLY_READ
+    folder = tmp_path_factory.mktemp("options")
+    read_only = command in ONLY_READ
     monkeypatch.chdir(folder)
     monkeypatch.setenv("MEREO_ASSETS", str(folder))
     monkeypatch.setenv("XDG_CACHE_HOME", str(folder.with_name("cache")))

@@ -119,7 +119,8 @@ def prepare(case: Case, inputs: Path, place: Path) -> str:
 
 def boundaries(changes: list[str], dear: bool) -> list[int]:
     """Changes before which to kill: those that follow the first of a kind, and the first moves themselves."""
-    numbers, seen = set[int](), set[str]()
+    numbers = set[int]()
+    seen = set[str]()
     for number, (event, place) in enumerate(change.split(" ", 1) for change in changes):
         name = re.sub("[0-9a-f]{8}|[0-9]+", "0", Path(place).name) if event in MOVES else Path(place).suffix
         if event in MOVES or (event != "open" and not dear):
@@ -132,7 +133,8 @@ def boundaries(changes: list[str], dear: bool) -> list[int]:
 @pytest.mark.parametrize("name", ["scene export", *SLOW])
 def test_a_killed_command_is_finished_by_the_next(name: str, inputs: Path, tmp_path: Path) -> None:
     """With the bytes of one that was never disturbed; nothing is left over, and no file of somebody else changes."""
-    case, before = CASES[name], content(inputs)
+    case = CASES[name]
+    before = content(inputs)
     fresh, whole, place = (tmp_path / folder for folder in ("fresh", "whole", "place"))
     arguments = prepare(case, inputs, fresh)
     shutil.copytree(fresh, whole)
@@ -170,7 +172,8 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 )
 def test_a_full_disk_is_said_and_leaves_nothing(name: str, room: int, inputs: Path, small_disk: Path) -> None:
     """No room at all, and some for folders, locks and the smallest files; with more the command does its work."""
-    case, place = CASES[name], small_disk
+    case = CASES[name]
+    place = small_disk
     arguments = prepare(case, inputs, place)
     before = content(place)
     with (place / "ballast").open("wb") as file:

@@ -74,7 +74,8 @@ def test_rigid_parts_and_fine_meshes_stay_as_they_are(tmp_path: Path, pliers: Sc
 
 def test_neighbours_split_a_shared_edge_alike(pliers: Scene) -> None:
     """The bores' rims on the plane z = 0 are edges of both levers, and have the same vertices afterwards."""
-    middle, radius = pliers.T_scene_source[:3, 3], 5 * pliers.T_scene_source[0, 0]
+    middle = pliers.T_scene_source[:3, 3]
+    radius = 5 * pliers.T_scene_source[0, 0]
     rims = []
     for segment in pliers.rest.segments[:2]:
         away = segment.vertices - middle
@@ -135,7 +136,8 @@ def test_a_rigid_motion_is_none_and_a_stretch_is_its_own() -> None:
     turn = Rigid(np.array([0.3, 0.2, 0.1]), np.array([5.0, 0, 0]), np.zeros(3))
     assert measure_motion(mesh, lambda rng: (turn,)).largest < 1e-12
     squash, (points, _) = Squash(np.zeros(3), np.array([0, 0, 1.0]), 1.1), material_points(mesh, 800)
-    way, found = norm(squash(points) - points, axis=1) / 2, measure_motion(mesh, lambda rng: (squash,))
+    way = norm(squash(points) - points, axis=1) / 2
+    found = measure_motion(mesh, lambda rng: (squash,))
     assert found.mean == pytest.approx(np.sqrt(np.mean(way**2)), rel=0.02)
     assert found.largest == pytest.approx(way.max(), rel=0.1)
 
@@ -203,7 +205,8 @@ def test_a_flat_base_is_found_in_any_position_and_of_a_box_the_side_that_is_down
 
 
 def test_what_is_round_or_falls_over_has_no_base() -> None:
-    rod, pebble = trimesh.creation.cylinder(1, 12), trimesh.creation.icosphere(4).apply_scale([1, 0.7, 0.25])
+    rod = trimesh.creation.cylinder(1, 12)
+    pebble = trimesh.creation.icosphere(4).apply_scale([1, 0.7, 0.25])
     for shape in (trimesh.creation.torus(3, 1), rod, pebble):
         part = Segment("part", (0, 0, 0), np.array(shape.vertices), np.array(shape.faces))
         assert flat_base(SegmentedMesh((part,)), (0.0, 0.0, 1.0)) is None
@@ -235,7 +238,8 @@ def test_a_base_is_named_where_the_camera_looks_from_below(tmp_path: Path, capsy
 
 
 def test_a_word_says_how_the_object_moves(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
-    files, said = write_pliers(tmp_path), list[str]()
+    files = write_pliers(tmp_path)
+    said = list[str]()
     scene = load_scene(write_scene_file(files, tmp_path / "auto.yaml", report=said.append))
     assert said[0] == "deformations: by its joints, for its parts touch like 2 hinges"
     hinge = "- type: joint  # turns on the round contact, radius 4.98, of pin and lower\n    segments: [lower]"

@@ -70,7 +70,8 @@ def off(model: StatisticalModel, found: ndarray, true: ndarray) -> float:
 
 
 def test_states_move_as_much_as_the_block_says_and_keep_segments_in_contact(scene: Scene) -> None:
-    half, moved = np.ptp(scene.rest.bounds, axis=0).max() / 2, []
+    half = np.ptp(scene.rest.bounds, axis=0).max() / 2
+    moved = []
     rest = scene.rest.segments
     shared = [np.isclose(part.vertices[:, 0], rest[0].vertices[:, 0].max()) for part in rest]
     for index in range(12):
@@ -134,7 +135,8 @@ def write_volume(folder: Path, nodes: ndarray, elements: ndarray) -> str:
 def volume() -> Tetrahedra:
     """Tetrahedra that fill the bar exactly, in its own unit."""
     lattice = build_lattice(SegmentedMesh((box((100, 0, 0), (140, 10, 10)),)), 16).mesh
-    low, size = lattice.nodes.min(axis=0), np.ptp(lattice.nodes, axis=0)
+    low = lattice.nodes.min(axis=0)
+    size = np.ptp(lattice.nodes, axis=0)
     return Tetrahedra([100, 0, 0] + (lattice.nodes - low) / size * [40, 10, 10], lattice.elements)
 
 
@@ -242,7 +244,8 @@ def test_a_given_pose_starts_the_fit_and_holds_what_is_held(held: tuple[Scene, S
     shift = true[base].mean(axis=0) - model.rest_points[base].mean(axis=0)
     world = rigid(np.eye(3), -shift)  # the drawn state keeps its centre of mass, a held one its base
     T = IN_FRONT @ world
-    cloud, true = seen(state.mesh.transformed(T)), transform_points(T, true)
+    cloud = seen(state.mesh.transformed(T))
+    true = transform_points(T, true)
     T_files = rigid(IN_FRONT[:3, :3], transform_points(IN_FRONT, scene.source_frame.T_scene_source[:3, 3]))
     (start,) = initial_states(T_files, model, 1.0)
     assert_allclose(start.place(model.mean), transform_points(IN_FRONT, model.mean), atol=1e-6)
@@ -267,8 +270,10 @@ def test_a_given_pose_weighs_as_its_error_says(held: tuple[Scene, StatisticalMod
 
 def test_pairs_by_direction_tell_the_sides_of_a_thin_part_apart(model: StatisticalModel) -> None:
     samples = SampledSurface.of(model, 2000).posed(Posed(np.eye(3), np.array([0.0, 0.0, 120.0]), np.zeros(model.count)))
-    points, top = samples.position.astype(float), samples.normal[:, 2] < -0.9
-    across, normals = np.ptp(points[:, 2]), samples.normal[top].astype(float)
+    points = samples.position.astype(float)
+    top = samples.normal[:, 2] < -0.9
+    across = np.ptp(points[:, 2])
+    normals = samples.normal[top].astype(float)
     beneath = points[top] + np.array([0.0, 0.0, 0.8 * across])
     # of all samples and not of facing ones alone, the nearest are those of the other side
     _, by_place, _ = samples.planes(beneath, Directions(signed, normals, 0.0))

@@ -62,7 +62,8 @@ def test_states_are_those_that_the_scene_plays(robot: mereo.Object, mechanism: M
 
 
 def test_derivatives_are_those_of_the_states(mechanism: Mechanism) -> None:
-    z, rows = mechanism.library[1].astype(float), mechanism.sparse
+    z = mechanism.library[1].astype(float)
+    rows = mechanism.sparse
     steps = 1e-4 * np.eye(mechanism.count)
     change = (mechanism.positions(z + steps, rows) - mechanism.positions(z - steps, rows)) / 2e-4
     assert_allclose(mechanism.tangent(z, rows), np.moveaxis(change, 0, 2), atol=1e-3)

@@ -71,7 +71,8 @@ def signed(solids: Solids, index: int, points: ndarray) -> ndarray:
 @pytest.mark.usefixtures("bones")
 def test_the_jaw_never_touches_the_skull() -> None:
     """At the corners of the range of motion: closed, ajar, wide; forward; to both sides."""
-    rest, condyles = skull.rest_mesh(), skull.condyles()
+    rest = skull.rest_mesh()
+    condyles = skull.condyles()
     upper, cranium = rest.segments[:2]
     still = Solids(rest)
     for share, forward, side in product((0.0, 0.1, 0.21, 0.6, 1.0), (0, 1), (-1, 0, 1)):
@@ -103,7 +104,8 @@ def test_a_closed_jaw_neither_slides_nor_turns() -> None:
 
 @pytest.mark.usefixtures("organs")
 def test_the_tumour_stays_hidden_in_the_liver() -> None:
-    scene, rng = load_scene("tumor"), default_rng(2)
+    scene = load_scene("tumor")
+    rng = default_rng(2)
     assert scene.rest.nested == (("tumor", "liver"),)
     depth = Solids(scene.rest).segment_distance(1, scene.rest.segments[0].vertices) / _liver_parts.MM
     assert depth.min() > 20
@@ -115,7 +117,8 @@ def test_the_tumour_stays_hidden_in_the_liver() -> None:
 
 @pytest.mark.usefixtures("organs")
 def test_the_tumours_place_and_size_vary_within_their_bounds() -> None:
-    rng, rest = default_rng(3), tumor.rest_mesh()
+    rng = default_rng(3)
+    rest = tumor.rest_mesh()
     inner, outer = rest.segments[0].vertices, rest.segments[1].vertices
     shifts, factors = [], []
     for _ in range(60):

@@ -28,8 +28,10 @@ class Moved:
 
 def sample_moves(rng: Generator) -> tuple[Deformation, ...]:
     """Moves by a direction, by rows and a rest that are directions, and by normal numbers that are none."""
-    toward, wave = named(rng, "toward").normal(size=(1, 3)), named(rng, "waves").normal(size=(4, 3))
-    sides, shares = unit_rows(wave[:2]), wave[2:] / norm(wave[2:])
+    toward = named(rng, "toward").normal(size=(1, 3))
+    wave = named(rng, "waves").normal(size=(4, 3))
+    sides = unit_rows(wave[:2])
+    shares = wave[2:] / norm(wave[2:])
     amounts = named(rng, "amounts").normal(size=3)
     return tuple(Moved(2 * unit_rows(toward)[0] + sides[i % 2] + 3 * shares[i % 2] + amounts) for i in range(4))
 
@@ -39,7 +41,8 @@ def test_what_is_a_direction_is_seen_by_what_its_length_moves() -> None:
     states = DrawnStates.of(scene, scene_model(scene, 30, 1000), 4, 1000)
     rows = {place[1].name: [row.tolist() for row in rows] for place, rows in states.directions.items()}
     assert rows == {"toward": [[0, 1, 2]], "waves": [[0, 1, 2], [3, 4, 5], [6, 7, 8, 9, 10, 11]], "amounts": []}
-    drawn, plain = states.drawn(1001), Drawn.of(scene, 1001)
+    drawn = states.drawn(1001)
+    plain = Drawn.of(scene, 1001)
     assert_allclose([norm(drawn.z[row]) ** 2 for row in drawn.directions], [1, 1, 1, 2.5])
     assert_allclose(drawn.z[-3:], plain.z[-3:])
     before, after = (states.played.moved(plain.deformations(scene, z) or ()) for z in (plain.z, drawn.z))
@@ -53,7 +56,9 @@ REFUSES = {"human": 7, "robot": 3, "rope": 1, "sheet": 5}
 @pytest.mark.parametrize("name", [*REFUSES, "lizard"])
 def test_a_scene_that_tests_its_states_plays_their_neighbours_without(name: str) -> None:
     scene = load_scene(name)
-    drawn, rng, refused = Drawn.of(scene, REFUSES.get(name, 7)), default_rng(0), 0
+    drawn = Drawn.of(scene, REFUSES.get(name, 7))
+    rng = default_rng(0)
+    refused = 0
     points = [segment.vertices[::50] for segment in scene.rest.segments]
     for _ in range(15):
         z = np.where(drawn.smooth, drawn.z + 3.0 * rng.normal(size=len(drawn.z)), drawn.z)

@@ -94,7 +94,8 @@ def test_declared_pairs_may_overlap_and_no_others_and_the_inner_segment_must_be_
 
 
 def test_distance_and_direction_lead_to_the_surface_of_what_the_owner_owns() -> None:
-    points, solids = default_rng(0).uniform(-6, 6, size=(5000, 3)), Solids(organ())
+    points = default_rng(0).uniform(-6, 6, size=(5000, 3))
+    solids = Solids(organ())
     points = points[clear_of(points, 0.02)]
     labels = solids.label(points)
     distance, direction = signed_distance_and_direction(solids, points, labels)
@@ -122,7 +123,8 @@ def test_the_template_has_the_signed_distance_to_what_each_segment_owns() -> Non
 
 
 def test_the_outside_of_a_nested_segment_is_the_segment_around_it() -> None:
-    solids, keep = Solids(organ()), 200
+    solids = Solids(organ())
+    keep = 200
     samples = sort_sample(solids, keep, 2 * keep, default_rng(0))
     core_in, core_out, organ_in, organ_out = np.split(samples.labels, 4)
     assert (core_in == 1).all() and (organ_in == 2).all() and (organ_out == 0).all()
@@ -170,8 +172,10 @@ def test_rest_coordinates_lie_in_the_owner_at_rest() -> None:
     def move_together(rng: Generator) -> tuple[Deformation, ...]:
         return (Shear(*(rng.uniform(-1, 1, size=3) * [1.5, 0.2, 0.15])),) * 2
 
-    scene, settings = Scene("organ", organ(), move_together), GenerateConfig(sampling=SamplingConfig(per_segment=128))
-    example, view = synthesize(scene, settings, example_rng(1, 0)), sample_view(scene, settings, example_rng(1, 0))
+    scene = Scene("organ", organ(), move_together)
+    settings = GenerateConfig(sampling=SamplingConfig(per_segment=128))
+    example = synthesize(scene, settings, example_rng(1, 0))
+    view = sample_view(scene, settings, example_rng(1, 0))
     queries, (center, half) = example.queries, rest_frame(scene.rest)
     rest = queries.rest * half + center
     inside = queries.labels > 0

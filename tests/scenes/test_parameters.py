@@ -77,7 +77,8 @@ def test_a_recorder_draws_whole_numbers_and_choices_as_numpy_does() -> None:
 
 def test_moving_one_number_moves_nothing_else() -> None:
     def sample(rng: Generator) -> tuple[Deformation, ...]:
-        along, across = named(rng, "along").uniform(-5.0, 5.0), named(rng, "across").uniform(1.0, 2.0)
+        along = named(rng, "along").uniform(-5.0, 5.0)
+        across = named(rng, "across").uniform(1.0, 2.0)
         return shifted(along, across, rng.normal())
 
     scene = scene_of(sample)
@@ -110,7 +111,8 @@ def test_draws_that_a_choice_brings_come_and_go_and_come_back_the_same() -> None
 
 def rejecting(rng: Generator) -> tuple[Deformation, ...]:
     while True:
-        one, other = named(rng, "one").uniform(0.0, 1.0), named(rng, "other").uniform(0.0, 1.0)
+        one = named(rng, "one").uniform(0.0, 1.0)
+        other = named(rng, "other").uniform(0.0, 1.0)
         if one + other > 1.5:
             break
     return shifted(one, other, rng.uniform(0.0, 1.0))

@@ -57,7 +57,8 @@ def test_segments_that_do_not_touch_bend_as_much_as_they_should_in_a_box_of_rubb
 
 def test_a_scene_that_is_loaded_again_is_not_refined_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By its content: not by its path, and other deformations are another scene."""
-    refined, calls = build.refined, []
+    refined = build.refined
+    calls = []
     monkeypatch.setattr(build, "refined", lambda *scene: (calls.append(1), refined(*scene))[1])
     build._kept.cache_clear()
     scenes = []
@@ -120,7 +121,8 @@ def test_segments_with_the_same_deformations_stay_in_contact(tmp_path: Path) -> 
 
 
 def test_parts_of_a_model_are_renamed_joined_and_left_out(tmp_path: Path) -> None:
-    path, parts = tmp_path / "box.yaml", {"Lid": box((0, 0, 2), (2, 2, 3)), "Body": box((0, 0, 0), (2, 2, 2))}
+    path = tmp_path / "box.yaml"
+    parts = {"Lid": box((0, 0, 2), (2, 2, 3)), "Body": box((0, 0, 0), (2, 2, 2))}
     write_model(tmp_path / "box.glb", {**parts, "Bolt": ball((9, 9, 9), 1)})
     head = "name: box\nunits: m\nmodel: box.glb\nparts:\n"
     path.write_text(f"{head}  - {{name: Body, nested_in: all}}\n  - {{name: all, parts: [Lid, Body]}}\n")
@@ -244,7 +246,8 @@ def test_every_key_is_documented_with_its_default() -> None:
     for kind, block in [("", SceneFile), ("", CameraBlock), *kinds.items()]:
         for key in block.model_fields.keys() - ({"type", "segments"} if kind else ()):
             start = rf"\| .*{kind}.* \| `{key}` \|" if kind else rf"\| `{key}` \|"
-            row, default = next(row for row in rows if re.match(start, row)), block.model_fields[key].default
+            row = next(row for row in rows if re.match(start, row))
+            default = block.model_fields[key].default
             assert type(default) not in (int, float) or f"| {default:g} |" in row
 
 

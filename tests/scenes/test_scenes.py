@@ -59,7 +59,8 @@ def states(scene: Scene) -> list[State]:
 
 
 def interior_points(scene: Scene, rng: Generator, count: int = 300) -> list[ndarray]:
-    solids, points = Solids(scene.rest), []
+    solids = Solids(scene.rest)
+    points = []
     for index, segment in enumerate(scene.rest.segments):
         draws = rng.uniform(*segment.bounds, size=(4000, 3))
         points.append(draws[solids.inside(index, draws)][:count])
@@ -77,7 +78,8 @@ def smallest_determinant(state: State, points: list[ndarray]) -> float:
 
 def assert_in_view(scene: Scene, mesh: SegmentedMesh, rng: Generator) -> None:
     """Whole, from random cameras; the corners of the convex hull decide, as all of it is in front of them."""
-    vertices, size = np.concatenate([segment.vertices for segment in mesh.segments]), GenerateConfig().image_size
+    vertices = np.concatenate([segment.vertices for segment in mesh.segments])
+    size = GenerateConfig().image_size
     hull = vertices[ConvexHull(vertices).vertices]
     camera = Camera.from_fov(size, size, scene.workspace.fov_rad)
     poses = np.stack([scene.workspace.sample(rng, mesh.bounds.mean(axis=0)) for _ in range(CAMERAS)])
@@ -129,7 +131,8 @@ def test_touching_segments_keep_touching(scene: Scene, states: list[State]) -> N
     ("count", "volumes"), [(STATES, (0.65, 1.6)), pytest.param(MANY_STATES, (0.4, 2.0), marks=pytest.mark.slow)]
 )
 def test_random_states_are_sound_apart_smooth_and_in_view(scene: Scene, count: int, volumes: Range) -> None:
-    rng, size = default_rng(8), GenerateConfig().image_size
+    rng = default_rng(8)
+    size = GenerateConfig().image_size
     inner = interior_points(scene, rng, 100)
     vertices = [rng.permutation(segment.vertices)[:300] for segment in scene.rest.segments]
     points = [np.concatenate(pair) for pair in zip(inner, vertices, strict=True)]
@@ -154,7 +157,8 @@ def test_random_states_are_sound_apart_smooth_and_in_view(scene: Scene, count: i
 
 def test_workspace_is_a_cone_of_the_stated_aperture_and_distance() -> None:
     rng = default_rng(6)
-    workspace, target = Workspace(axis=(0.0, 1.0, 0.0)), np.array([3.0, -2.0, 1.0])
+    workspace = Workspace(axis=(0.0, 1.0, 0.0))
+    target = np.array([3.0, -2.0, 1.0])
     poses = [workspace.sample(rng, target) for _ in range(1500)]
     offset = np.stack([pose[:3, 3] - target for pose in poses])
     distance = norm(offset, axis=1)

@@ -40,7 +40,8 @@ def test_an_affine_motion_of_the_nodes_is_one_of_all_space() -> None:
 
 
 def test_nodes_go_where_the_state_has_them_and_the_map_is_continuous_at_the_surface() -> None:
-    mesh, nodes = lattice(), states()[-1]
+    mesh = lattice()
+    nodes = states()[-1]
     deformation = TetrahedralMap(mesh, nodes)
     assert np.allclose(deformation(mesh.nodes), nodes, atol=1e-12)
     face = mesh.nodes[mesh.surface].mean(axis=1)
@@ -49,7 +50,8 @@ def test_nodes_go_where_the_state_has_them_and_the_map_is_continuous_at_the_surf
 
 
 def test_tetrahedra_have_the_jacobian_of_their_volumes() -> None:
-    mesh, nodes = lattice(), states()[0]
+    mesh = lattice()
+    nodes = states()[0]
     centers = mesh.nodes[mesh.elements].mean(axis=1)
     determinant = jacobian_determinant(TetrahedralMap(mesh, nodes), centers)
     assert np.allclose(determinant, mesh.volume_ratios(nodes), atol=1e-5)
@@ -68,7 +70,8 @@ def test_inverse_is_exact_inside_and_found_outside() -> None:
 
 
 def test_bad_tetrahedra_are_named() -> None:
-    nodes, elements = np.eye(4, 3), np.array([[0, 1, 2, 3]])
+    nodes = np.eye(4, 3)
+    elements = np.array([[0, 1, 2, 3]])
     for bad, of_them, message in (
         (nodes, np.array([[0, 1, 2, 3], [0, 1, 2, 2]]), "tetrahedron 1 has no volume at rest; it must have some"),
         (nodes, elements + 1, "refers to node 4, but there are 4; indices run from 0: subtract 1"),
@@ -92,7 +95,8 @@ def test_a_surface_alone_is_met_exactly_and_affine_motions_throughout() -> None:
 
 
 def test_the_interior_estimate_is_near_the_solid_that_made_the_surface() -> None:
-    part, rng = boxes().segments[0], default_rng(2)
+    part = boxes().segments[0]
+    rng = default_rng(2)
     points = rng.uniform(*part.bounds, size=(400, 3))
     surface = Surface(part.vertices, part.faces)
     for nodes in states()[[0, -1]]:
@@ -161,8 +165,10 @@ def bar(tmp_path: Path) -> Path:
 def drawn(path: Path, seed: int) -> set[int]:
     """The frames that a seed draws, told by the height of the bow, after checking each of them exactly."""
     scene = load_scene(path).for_seed(seed)
-    rng, found = default_rng(0), set()
-    scale, center = 2.0, np.array([120, 5, 5])  # the shortest side, 10 mm, becomes 20 units
+    rng = default_rng(0)
+    found = set()
+    scale = 2.0
+    center = np.array([120, 5, 5])  # the shortest side, 10 mm, becomes 20 units
     files = [read_segmented_mesh(path.parent / f"{name}.stl").segments[0].vertices for name in ("left", "right")]
     for _ in range(60):
         mesh = scene.sample_state(rng).mesh

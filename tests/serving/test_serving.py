@@ -268,9 +268,11 @@ def laptop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Setup:
 
 
 async def test_joints_are_in_the_answer_and_known_ones_are_of_one_request(tmp_path: Path, laptop: Setup) -> None:
-    address, cloud = "/v1/laptop/reconstruct?unit-m=1", np.load("frame.npy")
+    address = "/v1/laptop/reconstruct?unit-m=1"
+    cloud = np.load("frame.npy")
     joints = mereo.reconstruct(cloud, mereo.load_object("laptop.urdf"), unit_m=1.0).joints
-    free, true = to_json({"hinge": joints["hinge"].facts()}), round(joints["hinge"].value, 3)
+    free = to_json({"hinge": joints["hinge"].facts()})
+    true = round(joints["hinge"].value, 3)
     async with running(tmp_path / "s", given=laptop) as server:
         for given in (None, {"hinge": true}, {"name": ["wheel", "hinge"], "position": [0, true]}, None):
             query = "" if given is None else f"&{urlencode({'joints': json.dumps(given)})}"
@@ -412,7 +414,8 @@ async def test_impatience_leaves_no_work_behind(tmp_path: Path, monkeypatch: pyt
 async def test_a_frame_whose_client_has_left_is_not_begun(tmp_path: Path) -> None:
     async with running(tmp_path) as server:
         worker, first = await begun(server)
-        told, statuses = asyncio.Event(), list[int | None]()
+        told = asyncio.Event()
+        statuses = list[int | None]()
         messages = iter([{"type": "http.request", "body": npy(), "more_body": False}])
 
         async def receive() -> JsonObject:
@@ -803,7 +806,8 @@ def wait_for_the_end_of(processes: list[int]) -> None:
 
 @pytest.mark.slow
 def test_twenty_seconds_of_four_clients_and_the_end(tmp_path: Path) -> None:
-    address, scratch = "/v1/{weights}/reconstruct", tmp_path / "scratch"
+    address = "/v1/{weights}/reconstruct"
+    scratch = tmp_path / "scratch"
     scratch.mkdir()
     frames, _ = bench.one_after_the_other(bench.frames_of(["rope"], 6, tmp_path), "modes", 24, tmp_path)
     arguments = ("--weights", "rope", "--method", "modes", "--resolution", "24", "--workers", "2")
@@ -819,7 +823,8 @@ def test_twenty_seconds_of_four_clients_and_the_end(tmp_path: Path) -> None:
         assert json.loads(get(port, "/readyz")) == {"status": "ready"}
         workers = workers_of(server)
 
-        tallies, ended = [bench.Tally() for _ in range(4)], threading.Event()
+        tallies = [bench.Tally() for _ in range(4)]
+        ended = threading.Event()
         threads = [
             threading.Thread(target=bench.client, args=(port, frames, n, lambda: not ended.is_set(), address, tally))
             for n, tally in enumerate(tallies)

@@ -104,7 +104,8 @@ def until(condition: Callable[[], Any], timeout_s: float = 120.0) -> Any:
 
 def pixels_of(picture: ndarray, color: tuple[int, int, int], cosine: float = 0.99) -> int:
     """How many pixels have this hue, whatever the light."""
-    wanted, shown = np.asarray(color, float), picture.astype(float)
+    wanted = np.asarray(color, float)
+    shown = picture.astype(float)
     length = norm(shown, axis=-1)
     same = shown @ wanted / (np.maximum(length, 1e-9) * norm(wanted)) > cosine
     return int((same & (length > 60)).sum())

@@ -61,7 +61,9 @@ def run_command(folder: Path, arguments: str, at: int = -1) -> Ended:
 
 
 def _run(folder: Path, arguments: list[str], at: int, said: Path, changes: Path) -> None:
-    code, main, numbers = 98, os.getpid(), count()
+    code = 98
+    main = os.getpid()
+    numbers = count()
 
     def note(event: str, given: Any) -> None:
         if event not in CHANGES or os.getpid() != main or (event == "open" and not given[2] & os.O_CREAT):

@@ -181,7 +181,8 @@ def _bytes(content: bytes, rng: Random) -> bytes:
     spans = [match.span() for match in re.finditer(pattern, content[:65536])] if pattern else []
     start = rng.randrange(1 + min(len(content), rng.choice((512, len(content)))))
     start, end = rng.choice(spans[: rng.choice((40, 9999))]) if spans else (start, start + rng.randrange(1, 64))
-    piece, odd = content[start:end], rng.choice((*PIECES, rng.randbytes(8)))
+    piece = content[start:end]
+    odd = rng.choice((*PIECES, rng.randbytes(8)))
     if way in ("end", "new"):
         return content[:start] + (odd + content[start:] if way == "new" else b"")
     if way == "odd":
@@ -201,7 +202,8 @@ def _inside(content: bytes, rng: Random) -> bytes:
     if content.startswith(b"\x1f\x8b"):
         return gzip.compress(damaged(gzip.decompress(content), rng), mtime=0)
     if content.startswith(b"\x89PNG"):
-        chunks, at = list[tuple[bytes, bytes]](), 8
+        chunks = list[tuple[bytes, bytes]]()
+        at = 8
         while at < len(content):
             end = at + 8 + int.from_bytes(content[at : at + 4], "big")
             chunks.append((content[at + 4 : at + 8], content[at + 8 : end]))
@@ -214,7 +216,8 @@ def _inside(content: bytes, rng: Random) -> bytes:
         return content[:8] + b"".join(packed)
     if content.startswith(b"glTF"):
         end = 20 + int.from_bytes(content[12:16], "little")
-        text, rest = json.dumps(_changed(json.loads(content[20:end]), rng)).encode(), content[end:]
+        text = json.dumps(_changed(json.loads(content[20:end]), rng)).encode()
+        rest = content[end:]
         text += b" " * (-len(text) % 4)
         return b"glTF" + struct.pack("<IIII", 2, 20 + len(text + rest), len(text), 0x4E4F534A) + text + rest
     if content[8:9] == b"{":  # safetensors
@@ -366,7 +369,8 @@ def statistical_model() -> StatisticalModel:
 @lru_cache(1)
 def tiny_model() -> Model:
     torch.manual_seed(0)
-    network, model = Network(PRESETS["tiny"].network, 4).eval(), statistical_model()
+    network = Network(PRESETS["tiny"].network, 4).eval()
+    model = statistical_model()
     return Model(network, model.rest.names, tuple((i, 2, 3) for i in range(4)), statistical_model=model)
 
 
@@ -416,14 +420,17 @@ def claimed(path: Path) -> None:
 
 
 def scores(path: Path) -> None:
-    names, pair = tiny_model().names, {"iou": 0.5, "miou": 0.25, "miou_up_to_symmetry": 0.25}
+    names = tiny_model().names
+    pair = {"iou": 0.5, "miou": 0.25, "miou_up_to_symmetry": 0.25}
     answers = {name: {**pair, "seconds": 1.5} for name in ("network", "modes")}
     facts = {"weights": "w", "examples": 2, "seed": 1_000_000, "noise_std": 0.1}
     write_json(path, {**facts, **pair, "per_segment": dict.fromkeys(names, 0.5), "example_mean": pair, **answers})
 
 
 def truth(path: Path) -> None:
-    scene, scan, rest = write_bar(path.parent, EVERYTHING), path.with_name("scan.npy"), bar().rest
+    scene = write_bar(path.parent, EVERYTHING)
+    scan = path.with_name("scan.npy")
+    rest = bar().rest
     np.save(scan, POINTS)
     placed = tuple(PlacedSegment(name, np.eye(4), "scan", 9, 0.1, 0.1, 0.1, 0.0, 0.0, 6) for name in rest.names)
     whole = Placement(placed, rest, 0.9, 1.0)
@@ -531,7 +538,8 @@ def inputs(name: str, folder: Path, seed: int) -> Iterator[tuple[bytes, bool, st
     path = folder / name
     path.parent.mkdir(parents=True, exist_ok=True)
     TARGETS[name].write(path)
-    whole, number = path.read_bytes(), 0
+    whole = path.read_bytes()
+    number = 0
     assert fault_of(TARGETS[name].read, path) == (True, ""), f"{name} breaks the rule before it is damaged"
     while True:
         content = damaged(whole, Random(f"{seed}/{name}/{number}"))

@@ -205,7 +205,8 @@ def difference(kept: JsonObject, now: JsonObject) -> str | None:
 def last_bits_of(name: str, trials: int = TRIALS) -> dict[str, float]:
     """Largest change of each number of an object's firm answer in some trials, and in those that were kept."""
     (frame,) = (frame for frame_name, frame in frames_of(name) if frame_name == FIRM[name])
-    kept, rng = kept_of(name)[FIRM[name]], default_rng()
+    kept = kept_of(name)[FIRM[name]]
+    rng = default_rng()
     most = dict.fromkeys(NEAR, 0.0) | kept.get("last_bits", {})
     for trial in range(trials):
         moved = frame.points * (1.0 + min(trial, 1) * LAST_BIT * rng.standard_normal(frame.points.shape))

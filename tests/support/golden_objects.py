@@ -102,7 +102,9 @@ def train(name: str, folder: Path) -> None:
 
     from mereo.models.weights import load_model, save_model
 
-    scene, data, run = OWN[name](folder / name), folder / f"{name}-data", folder / f"{name}-run"
+    scene = OWN[name](folder / name)
+    data = folder / f"{name}-data"
+    run = folder / f"{name}-run"
     small = run / "small.safetensors"
 
     def mereo(*command: object) -> None:

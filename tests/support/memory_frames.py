@@ -25,7 +25,8 @@ def records(points: ndarray, names: str = "xyz", kind: str = "f4", skip: int = 0
     """Structured array of points: ``skip`` bytes, the axes in the order of ``names``, then a colour."""
     size = np.dtype(kind).itemsize
     offsets = [skip + size * index for index in range(3)]
-    formats, places = [kind] * 3 + ["u4"], [*offsets, skip + 3 * size]
+    formats = [kind] * 3 + ["u4"]
+    places = [*offsets, skip + 3 * size]
     layout = np.dtype({"names": [*names, "rgb"], "formats": formats, "offsets": places, "itemsize": places[3] + 7})
     made = np.full(points.shape[:-1], 7, layout)
     for index, axis in enumerate("xyz"):

@@ -32,7 +32,8 @@ def save_pcd(points: ndarray, layout: str) -> bytes:
 
 def lzf_compress(data: bytes) -> bytes:
     """Runs of four bytes that come again, 3 to 264 bytes long, and literals."""
-    out, at = bytearray(), 0
+    out = bytearray()
+    at = 0
     while at < len(data):
         pairs = zip(data[at : at + 264], data[at - 4 : at + 260], strict=False) if at > 3 else ()
         length = sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))

@@ -96,7 +96,8 @@ def _template() -> ndarray:
 
 
 def half_balls(rng: Generator, points: int, queries: int) -> dict[str, ndarray]:
-    radius, center = rng.uniform(5.0, 10.0), np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(100, 200)])
+    radius = rng.uniform(5.0, 10.0)
+    center = np.array([rng.uniform(-5, 5), rng.uniform(-5, 5), rng.uniform(100, 200)])
     front = unit_rows(rng.normal(size=(points, 3)))
     front[:, 2] = -np.abs(front[:, 2])
     cloud = center + radius * front
@@ -124,7 +125,8 @@ def example_of(
     rest: ndarray,
 ) -> dict[str, ndarray]:
     """Arrays of an example as they are stored, of points and distances in the camera's frame and unit."""
-    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    low = cloud.min(axis=0)
+    high = cloud.max(axis=0)
     middle, scale = (low + high) / 2, 2 / (high - low).max()
     return {
         "cloud": ((cloud - middle) * scale).astype(np.float32),

@@ -21,7 +21,8 @@ def check(function: Callable[..., Any]) -> Any:
         return function  # of a command, whose required options are tyro.MISSING before it is parsed
     if "<locals>" not in function.__qualname__ or function.__code__.co_filename != "<string>":
         return CHECKED(function)  # not one that jaxtyping has made
-    code, annotations = function.__code__, tuple(function.__annotations__.items())
+    code = function.__code__
+    annotations = tuple(function.__annotations__.items())
     key = (function.__module__, function.__qualname__, code.co_varnames, code.co_argcount, code.co_flags, annotations)
     try:
         made = _made.get(key)

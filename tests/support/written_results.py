@@ -16,7 +16,8 @@ SIDES = np.array([0.02, 0.04, 0.08])
 
 def segments() -> SegmentedMesh:
     """Names and colours that exporters tend to change: spaces, accents, dark colours; one segment without faces."""
-    ball, box = trimesh.creation.icosphere(2, radius=0.01), trimesh.creation.box(SIDES)
+    ball = trimesh.creation.icosphere(2, radius=0.01)
+    box = trimesh.creation.box(SIDES)
     lost = Segment(NAMES[1], COLORS[1], np.empty((0, 3)), np.empty((0, 3), np.int64))
     return SegmentedMesh(
         (
@@ -30,7 +31,8 @@ def segments() -> SegmentedMesh:
 def grid() -> LabelGrid:
     """The box is label 3, and the voxel at its corner with the largest x, y, z is label 1; 5 mm voxels, no cube."""
     labels = np.zeros((7, 11, 20), np.uint8)
-    origin, spacing = np.array([0.085, 0.175, 0.4525]), np.full(3, 0.005)
+    origin = np.array([0.085, 0.175, 0.4525])
+    spacing = np.full(3, 0.005)
     places = np.stack(np.meshgrid(*(np.arange(n) for n in labels.shape), indexing="ij"), axis=-1) * spacing + origin
     labels[(np.abs(places - CENTER) <= SIDES / 2 + 1e-9).all(axis=-1)] = 3
     labels[tuple(np.argwhere(labels == 3).max(axis=0))] = 1

@@ -305,7 +305,8 @@ def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> 
     assert gaps.min(axis=1).max() < 1e-6
     assert len(np.unique(gaps.argmin(axis=1))) == len(kept) == min(len(seen), SETTINGS.points)
     box = example.normalizer.apply(seen)
-    low, high = box.min(axis=0), box.max(axis=0)
+    low = box.min(axis=0)
+    high = box.max(axis=0)
     assert np.isclose((high - low).max(), 2) and np.allclose(low + high, 0)
     distance = Solids(view.mesh).nearest(seen).distance
     # noise is along the ray: never farther from the surface than that, 0.1 in standard deviation
@@ -314,7 +315,8 @@ def test_the_cloud_is_the_depth_image_unprojected_and_normalized(case: Case) -> 
 
 def test_labels_distances_and_directions_are_those_of_the_deformed_segments(case: Case) -> None:
     example, view = case
-    queries, solids = example.queries, Solids(view.mesh)
+    queries = example.queries
+    solids = Solids(view.mesh)
     points = example.normalizer.invert(queries.positions)
     clear = solids.nearest(points).distance > 1e-6
     assert np.array_equal(solids.label(points[clear]), queries.labels[clear])
@@ -338,7 +340,8 @@ def test_rest_coordinates_lead_back_to_the_query_and_lie_in_the_same_segment_at_
         assert members.sum() >= 64
         assert np.abs(deformation(rest[members]) - world[members]).max() < 1e-3
         assert (np.abs(queries.rest[members]) <= 1 + 1e-4).all()
-    inside, solids = queries.labels > 0, Solids(TOY.rest)
+    inside = queries.labels > 0
+    solids = Solids(TOY.rest)
     rest = rest[inside]
     # faces are flat before and after, the map between them is not: only points beside a face may change sides
     clear = solids.nearest(rest).distance > 0.1

@@ -147,9 +147,11 @@ def test_queries_of_an_example(sampler: str) -> None:
 def test_settings_reach_the_sampler_and_uniform_points_are_the_papers_share_of_all() -> None:
     """Appendix B: "15% of total points"."""
     for segments in range(1, 40):
-        total, near = SamplingConfig().total(segments), 256 * segments
+        total = SamplingConfig().total(segments)
+        near = 256 * segments
         assert abs((total - near) - 0.15 * total) < 1
-    shape, config = shapes()["balls"], SamplingConfig(per_segment=80, oversample=3, box_margin=0.8, uniform_fraction=0)
+    shape = shapes()["balls"]
+    config = SamplingConfig(per_segment=80, oversample=3, box_margin=0.8, uniform_fraction=0)
     queries = sample_queries(shape, config, default_rng(4))
     direct = sort_sample(shape, 40, 120, default_rng(4), extended_boxes(shape, 0.8))
     assert_array_equal(queries.points, direct.points)

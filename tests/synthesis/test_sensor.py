@@ -43,7 +43,8 @@ MODELS = ("structured-light", "time-of-flight")
 
 def wall(z: float, tilt_deg: float = 0.0) -> Solids:
     part = box((-9000, -9000, 0), (9000, 9000, 5))
-    cosine, sine = np.cos(np.deg2rad(tilt_deg)), np.sin(np.deg2rad(tilt_deg))
+    cosine = np.cos(np.deg2rad(tilt_deg))
+    sine = np.sin(np.deg2rad(tilt_deg))
     turn = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]])
     return Solids(one(replace(part, vertices=part.vertices @ turn.T + [0, 0, z])))
 
@@ -60,7 +61,8 @@ def look(solids: Solids, seed: int = 0, noise_std: float = 0.0, **terms: object)
 
 def test_published_values() -> None:
     """By hand from the papers' formulas: Kinect at 1 m and at 0.4 m and 45 degrees, Kinect v2 at 2 m; pixels."""
-    z, flat = np.array([1.0]), np.zeros(1)
+    z = np.array([1.0])
+    flat = np.zeros(1)
     assert axial_std_m(z, flat) == pytest.approx(0.001884)
     assert axial_std_m(np.array([0.4]), np.array([pi / 4])) == pytest.approx(0.0012 + 0.0001 / np.sqrt(0.4))
     assert axial_std_m(np.array([2.0]), flat, "time-of-flight") == pytest.approx(0.0017)
@@ -87,7 +89,8 @@ def test_axial_noise_has_the_published_deviation(model: SensorModel, z: float, t
 @pytest.mark.parametrize("model", MODELS)
 def test_lateral_noise_reads_depth_beside_the_pixel(model: SensorModel) -> None:
     """On a slanted wall z = c / (n x), so the depth is off by dz/dx = -z^2 nx / c times where the pixel looks."""
-    tilt, z = np.deg2rad(50.0), 150.0
+    tilt = np.deg2rad(50.0)
+    z = 150.0
     clean = look(wall(z, 50.0)).whole.depth
     off = look(wall(z, 50.0), model=model, lateral=1.0).whole.depth - clean
     slope = clean**2 * np.sin(tilt) / (z * np.cos(tilt))
@@ -196,10 +199,13 @@ NARROW = Camera.from_fov(96, 96, float(np.deg2rad(30)))
 
 
 def test_depth_of_a_sphere_is_the_smaller_root_of_the_ray_equation() -> None:
-    center, radius = np.array([6.0, -4.0, 150.0]), 25.0
+    center = np.array([6.0, -4.0, 150.0])
+    radius = 25.0
     depth = render_depth(one(ball(tuple(center), radius, level=5)), NARROW).depth
     rays = NARROW.directions()
-    a, b, c = (rays**2).sum(-1), rays @ center, center @ center - radius**2
+    a = (rays**2).sum(-1)
+    b = rays @ center
+    c = center @ center - radius**2
     discriminant = b**2 - a * c
     expected = np.where(discriminant > 0, (b - np.sqrt(np.maximum(discriminant, 0))) / a, 0.0)
     miss = norm(center - (b / a)[..., None] * rays, axis=-1)  # how far the ray passes from the centre
@@ -277,7 +283,9 @@ def test_rays_that_are_left_out_would_have_missed(part: Segment, monkeypatch: py
 @pytest.mark.parametrize("term", ["tool", "hand"])
 def test_occluders_are_in_front_hide_the_object_and_come_from_outside(term: str) -> None:
     clear = look(PAIR, 0)
-    depth, hidden, borders = clear.whole.depth, [], 0
+    depth = clear.whole.depth
+    hidden = []
+    borders = 0
     for seed in range(40):
         seen = look(PAIR, seed, **{term: 1.0})
         occluder = seen.source == OCCLUDER

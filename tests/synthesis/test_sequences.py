@@ -137,7 +137,8 @@ def test_a_sequence_of_one_frame_and_test_seeds_are_refused(tmp_path: Path, caps
 def test_a_recording_holds_frames_and_their_truth_to_be_played_again(tmp_path: Path, moments: list[Moment]) -> None:
     scene = toy_scene()
     write_recording(tmp_path, scene, SHORT, ("paper", SENSORS["paper"]), 5)
-    index, truth = read_json(tmp_path / "recording.json"), np.load(tmp_path / "truth.npz")
+    index = read_json(tmp_path / "recording.json")
+    truth = np.load(tmp_path / "truth.npz")
     assert is_recording_folder(tmp_path) and len(index["frames"]) == 12 and index["unit_m"] == 0.005
     assert truth["counts"].tolist() == [[len(s.vertices), len(s.faces)] for s in moments[0].mesh.segments]
     assert_array_equal(truth["faces"], moments[0].mesh.merged()[1])

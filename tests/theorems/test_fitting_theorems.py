@@ -65,7 +65,8 @@ def test_noise_along_the_lines_of_sight_says_nothing_of_where_the_surface_is(
 
 
 def test_what_a_line_of_sight_misses_or_meets_far_off_is_compared_with_the_nearest_place(at_rest: Surface) -> None:
-    low, high = at_rest.material.min(axis=0), at_rest.material.max(axis=0)
+    low = at_rest.material.min(axis=0)
+    high = at_rest.material.max(axis=0)
     beside, middle = high + np.array([1.0, 1.0, 0.0]), (low + high) / 2 + np.array([0.0, 0.0, 4.0])
     points = np.stack([beside, middle])
     for found, nearest in zip(at_rest.along_sight(points, 0.5), at_rest.nearest(points), strict=True):

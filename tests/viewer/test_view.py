@@ -127,7 +127,8 @@ def test_points_give_way_to_colours_and_a_probe_is_shown(server: object) -> None
 
 @needs_viser
 def test_a_click_on_what_the_camera_saw_has_it_answered_there(server: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    around, clicked = PointCloud(np.array([[-40.0, 0, 170], [0, 0, 150], [60, 20, 160]])), list[ndarray]()
+    around = PointCloud(np.array([[-40.0, 0, 170], [0, 0, 150], [60, 20, 160]]))
+    clicked = list[ndarray]()
     contents = [replace(toy_content(), title="again", verdict="as clicked", colorings={}), ValueError("nothing there")]
 
     def content_of(_: object) -> Content:
@@ -176,7 +177,9 @@ def test_what_is_around_others_is_seen_through_and_axes_are_of_a_round_length(se
 @needs_viser
 @pytest.mark.parametrize("aspect", [390 / 844, 1.5])
 def test_a_page_looks_at_the_middle_of_the_object_from_where_all_of_it_is_seen(server: object, aspect: float) -> None:
-    stage, camera, bounds = ResultPage(server, toy_content()).stage, SimpleNamespace(), toy_content().bounds
+    stage = ResultPage(server, toy_content()).stage
+    camera = SimpleNamespace()
+    bounds = toy_content().bounds
     stage._turn(camera, aspect)
     assert_allclose(camera.look_at, stage.place(bounds.mean(axis=0)), atol=1e-9)
     half_angle = np.arctan(np.tan(np.deg2rad(20)) * min(aspect, 1))
@@ -329,7 +332,8 @@ def test_the_camera_stands_where_its_place_says_and_sees_the_state() -> None:
 
 def test_pictures_do_not_flicker_and_follow_a_slider() -> None:
     laboratory = Laboratory(toy_scene(), None, None)
-    played, place = random_state(laboratory.scene, 2), laboratory.first_place
+    played = random_state(laboratory.scene, 2)
+    place = laboratory.first_place
     first, again = (laboratory.look(played, place).depth.depth for _ in range(2))
     assert_array_equal(first, again)
     moved = set_value(laboratory.scene, played, parameters(played)[-1], 0.5)
@@ -552,9 +556,11 @@ def test_an_inner_segment_is_seen_through_the_outer_one(folder: Path) -> None:
 
 
 def test_places_are_asked_of_a_results_surfaces(folder: Path) -> None:
-    content, head = content_of_files(folder), found().segments[0]
+    content = content_of_files(folder)
+    head = found().segments[0]
     assert content.ask is not None
-    middle, rim = head.vertices.mean(axis=0), head.vertices[0]
+    middle = head.vertices.mean(axis=0)
+    rim = head.vertices[0]
     inside, outside, on_it = (content.ask(point[None]) for point in (middle, middle + 5.0, rim))
     assert inside.label == 1 and outside.label == 0 and on_it.label == 1
     size = norm(rim - middle)

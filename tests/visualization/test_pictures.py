@@ -355,7 +355,9 @@ def test_distance_to_what_was_observed_tells_seen_from_guessed() -> None:
 
 
 def test_a_ray_meets_the_nearest_surface_that_is_shown() -> None:
-    mesh, origin, along = two_balls(), np.array([-9.0, 0.01, 0.02]), np.array([2.0, 0.0, 0.0])
+    mesh = two_balls()
+    origin = np.array([-9.0, 0.01, 0.02])
+    along = np.array([2.0, 0.0, 0.0])
     assert_allclose(first_point(mesh, origin, along, [True, True]), [-2.0, 0.01, 0.02], atol=0.05)
     assert_allclose(first_point(mesh, origin, along, [False, True]), [4.0, 0.01, 0.02], atol=0.05)
     assert first_point(mesh, origin, along, [False, False]) is None

@@ -170,7 +170,8 @@ def test_a_browser_draws_every_segment(tmp_path: Path, mode: str) -> None:
     Report(cloud, mesh, summary).write(tmp_path / "r.html")
     with Page(tmp_path, (tmp_path / "r.html").as_uri() + mode, (1000, 800)) as page:
         drawing = until(lambda: re.search(r'data-drawing="(\w+)"', page.evaluate("document.documentElement.outerHTML")))
-        text, picture = drawing.string, page.screenshot()
+        text = drawing.string
+        picture = page.screenshot()
     assert drawing[1] == "canvas" or not mode
     table = re.search(r'<table id="table">(.*?)</table>', text, re.DOTALL)
     assert table

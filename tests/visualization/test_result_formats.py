@@ -75,7 +75,8 @@ def test_every_format_is_written_where_the_table_says(answer: Answer, tmp_path: 
 @pytest.mark.parametrize("millimetres, factor", [(False, 1.0), (True, 10.0)])
 def test_units(found: Reconstruction, tmp_path: Path, millimetres: bool, factor: float) -> None:
     """The cloud is in centimetres: GLB is in metres, volumes in millimetres, the others as asked for."""
-    out, center = tmp_path, np.array(BIG[0])
+    out = tmp_path
+    center = np.array(BIG[0])
     formats = chosen_formats(["glb", "ply", "stl", "obj", "vti", "points", "seg.nrrd"])
     parts = found.surfaces, found.labels, found.observed
     write_formats(out, formats, Results(*parts, GLTF_CAMERA_ROTATION, 0.01, millimetres))
@@ -132,8 +133,10 @@ def test_a_missing_extra_is_said_before_the_work(
 
 
 NESTED = (("core", "organ"),)
-CENTER, RADIUS = (0.0, 0.0, 5.0), 1.0
-CORE_CENTER, CORE_RADIUS = (0.2, 0.1, 4.9), 0.5
+CENTER = (0.0, 0.0, 5.0)
+RADIUS = 1.0
+CORE_CENTER = (0.2, 0.1, 4.9)
+CORE_RADIUS = 0.5
 
 
 CLOUD = front(CENTER, RADIUS, -1.0)

@@ -227,7 +227,8 @@ def test_a_failed_object_stops_no_other_and_the_same_call_continues(
         return {"iou": 0.9, "miou": None, "trained": True, "method": "auto"}
 
     monkeypatch.setattr(learning, "learn", learn)
-    folder, out = folder_of_objects(tmp_path), tmp_path / "out"
+    folder = folder_of_objects(tmp_path)
+    out = tmp_path / "out"
     with pytest.raises(ValueError, match=r"1 of 2 objects could not be learnt \(bar\)"):
         learn_objects(folder, out, LearnConfig(minutes=2.0))
     printed = capsys.readouterr()

@@ -116,7 +116,9 @@ def test_workers_change_no_bit(workers: int, whole: dict[str, bytes], tmp_path: 
 
 def test_nodes_that_die_lose_nothing(nodes: tuple[Any, str], whole: dict[str, bytes], tmp_path: Path) -> None:
     """Up to ten times a worker is killed, or a node, which another one then replaces."""
-    output, killed, rng = tmp_path / "data", list[str](), default_rng(7)
+    output = tmp_path / "data"
+    killed = list[str]()
+    rng = default_rng(7)
     made_nodes, place = nodes
     work = partial(generate, toy_scene(), output, SMALL, examples=EXAMPLES, seed=3, ray=made_nodes.address)
     with ThreadPoolExecutor(1) as thread:  # nodes can be started in the main thread alone

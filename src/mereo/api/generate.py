@@ -43,7 +43,8 @@ def generate(
 
     Raises as ``mereo_learning.shards.generate`` does, and ``TypeError`` without ``examples``.
     """
-    place, processes = place_of(output), workers or os.cpu_count() or 1
+    place = place_of(output)
+    processes = workers or os.cpu_count() or 1
     check_names(dataset, names_of(shards.DatasetConfig))
     with python_words():
         shards.generate(

@@ -197,7 +197,8 @@ def load_object(
     ``TypeError`` for an option that there is none of.
     """
     check_names(inference, OPTIONS)
-    meshes, computing = MeshesConfig(units, deformations, robot_meshes), InferenceConfig(**inference)
+    meshes = MeshesConfig(units, deformations, robot_meshes)
+    computing = InferenceConfig(**inference)
     network = weights if source is None else source
     if isinstance(network, Trained) or (isinstance(network, AnyPath) and (source is None or is_weights(network))):
         if source is not None and weights is not None:
@@ -305,7 +306,8 @@ def _scene(source: Source, meshes: MeshesConfig) -> Scene:
         )
     files = [Path(str(file)) for file in given]
     if len(files) == 1 and files[0].is_dir():
-        folder, learned = files[0], scene_of_folder(files[0])
+        folder = files[0]
+        learned = scene_of_folder(files[0])
         files = [Path(learned)] if learned is not None else shapes_in(folder)
         if not files:
             raise ValueError(

@@ -122,7 +122,8 @@ def load_frame(
     mask, axes_or_camera = None if mask is None else Path(mask), "camera" if axes is None else axes
     is_file = isinstance(intrinsics, AnyPath)
     options |= {"frame": axes_or_camera, "mask": mask, "mask_value": values}
-    reading, pose = InputConfig(intrinsics=Path(intrinsics) if is_file else None, **options), None
+    reading = InputConfig(intrinsics=Path(intrinsics) if is_file else None, **options)
+    pose = None
     if camera_pose is not None:
         pose = read_pose(Path(camera_pose)) if isinstance(camera_pose, AnyPath) else checked_pose(camera_pose)
     if not isinstance(source, AnyPath):

@@ -702,8 +702,12 @@ class StoredResult(SegmentedResult):
     def transformed(self, T_new_frame: ArrayLike) -> "StoredResult":
         """As ``Result.transformed``."""
         T = checked_pose(T_new_frame)
-        facts, surfaces, labels, state = self.to_dict(), self.surfaces, self.labels, self.state
-        further, frame = tuple(each.transformed(T) for each in self.further), self.frame.transformed(T)
+        facts = self.to_dict()
+        surfaces = self.surfaces
+        labels = self.labels
+        state = self.state
+        further = tuple(each.transformed(T) for each in self.further)
+        frame = self.frame.transformed(T)
         facts |= {"frame": "other", "depth_m": None, "T_input_result": frame.T_input_result}
         if surfaces is not None and labels is not None:
             surfaces = surfaces.transformed(T)
@@ -735,7 +739,8 @@ class StoredResult(SegmentedResult):
     def _results(self, files: FilesConfig) -> Results:
         if self.surfaces is None or self.labels is None:
             raise ValueError(self.facts["recognition"]["reason"])
-        to_viewer, unit_m = to_viewer_of(self.frame), self.frame.metres
+        to_viewer = to_viewer_of(self.frame)
+        unit_m = self.frame.metres
         return Results(self.surfaces, self.labels, None, to_viewer, unit_m, files.millimetres, self.facts)
 
     def _write_folder(self, directory: Path, files: FilesConfig) -> None:
@@ -773,7 +778,8 @@ def load_result(folder: str | Path, object: Source = None) -> StoredResult:
     """
     folder = checked_path(folder, "folder")
     summary, surfaces, labels = (folder / WRITERS[name].file for name in ("json", "glb", "npz"))
-    glb, known = read_glb(surfaces), None if object is None else object_of(object)
+    glb = read_glb(surfaces)
+    known = None if object is None else object_of(object)
     meshes = {segment.name: segment for segment in glb.mesh.segments}
     with readable(labels, "label grid"):
         values, origin, spacing, names = map(read_arrays(labels).__getitem__, ("labels", "origin", "spacing", "names"))

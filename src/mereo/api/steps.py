@@ -92,7 +92,8 @@ def evaluate(
     """
     changes = {name: str(value) if isinstance(value, Path) else value for name, value in changes.items()}
     with python_words():
-        config, workers = with_changes(config, changes), choose_cluster(ray) or 1
+        config = with_changes(config, changes)
+        workers = choose_cluster(ray) or 1
         if output is not None:
             return evaluate_weights(model, output, config, inference=inference, workers=workers, force=overwrite)
         loaded = model if isinstance(model, Model) else load_for(model, settings_for(inference, workers))
@@ -184,7 +185,8 @@ def learn(
     Raises ``ValueError`` for other arguments than the folder was begun with, and as the stages do.
     """
     given = object if isinstance(object, Iterable) and not isinstance(object, str) else [object]
-    files, folder = [checked_path(file, "object") for file in given], checked_path(output, "output")
+    files = [checked_path(file, "object") for file in given]
+    folder = checked_path(output, "output")
     check_value("train", train, TrainChoice, "auto")
     check_value("minutes", minutes, Positive, 10.0)
     if units is not None:

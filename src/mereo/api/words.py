@@ -48,7 +48,8 @@ def in_python(text: str) -> str:
 
 
 def _argument(option: re.Match[str]) -> str:
-    name, value = option[1].replace("-", "_"), option[2]
+    name = option[1].replace("-", "_")
+    value = option[2]
     return name if value is None else f"{name}={value.lower() if value.isupper() else value}"
 
 

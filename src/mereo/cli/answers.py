@@ -118,7 +118,8 @@ class ViewCommand(FrameOptions):
         from mereo_viewer.server import import_viser
 
         import_viser()  # its absence is better said before the work
-        input, known = self.input, None
+        input = self.input
+        known = None
         if input is None and not self.object and self.weights is not None:
             if self.weights not in shipped_views():
                 raise ValueError(

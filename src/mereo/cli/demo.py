@@ -55,9 +55,11 @@ class Demo:
         from mereo.models.weights_place import has_network
 
         check_place(self.output, may_be_link=True)
-        scores, began = JsonObject(), perf_counter()
+        scores = JsonObject()
+        began = perf_counter()
         for name, title, known, frame, truth in _inputs(self.output):
-            folder, started = self.output / name, perf_counter()
+            folder = self.output / name
+            started = perf_counter()
             check_new_directory(folder, force=True)
             with shown_stages():
                 result = reconstruct(frame, known, resolution=RESOLUTION)
@@ -95,7 +97,8 @@ def _inputs(output: Path) -> "Iterator[tuple[str, str, Object, SensorFrame, Trut
     model = statistical_model_in("bunny")
     assert model.source_frame is not None
     rest = model.rest.transformed(inv(model.source_frame.T_scene_source))  # as in its files, metres
-    frame, truth = load_frame(SHIPPED_SCAN), truth_grid(rest.transformed(inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
+    frame = load_frame(SHIPPED_SCAN)
+    truth = truth_grid(rest.transformed(inv(BUNNY_SCAN_POSES[SHIPPED_SCAN])))
     with new_directory(output / FRAME.parent, force=True) as folder:
         points = frame.cloud.points
         seen = transform_points(into_camera(points, frame.axes), points)
@@ -121,7 +124,8 @@ def _print_scores(title: str, result: "Result", truth: "TruthGrid") -> dict[str,
     from mereo.visualization.units import Unit
 
     confusion = grid_confusion(truth, labels_on(result.surfaces, truth.grid), len(result.names))
-    scores, unit = intersection_over_union(confusion), Unit(result.unit_m)
+    scores = intersection_over_union(confusion)
+    unit = Unit(result.unit_m)
     print(title)
     for segment, iou in zip(result, scores.per_segment, strict=True):
         volume = f"{unit.volume(segment.volume)} {unit.volume_name}"

@@ -132,7 +132,9 @@ def loaded_object(command: FrameOptions, inference: InferenceConfig | None = Non
     from mereo.scenes.registry import load_scene
     from mereo.scenes.scene import SCENES
 
-    object, scene, inference = command.object, getattr(command, "scene", None), inference or command.inference
+    object = command.object
+    scene = getattr(command, "scene", None)
+    inference = inference or command.inference
     if object and scene is not None:
         raise ValueError(f"--scene is {scene}, but --object says what the object is: leave one of them out")
     source = (object[0] if len(object) == 1 else list(object)) or None
@@ -242,7 +244,8 @@ def _items(settings: Any, prefix: str) -> Iterator[tuple[str, str, Any, Any]]:
     """Field, name of its option, kind and value; the name of a group ends with a dot, or is the prefix alone."""
     kinds = get_type_hints(type(settings), include_extras=True)
     for attribute in (item.name for item in fields(settings) if item.name != "options_from"):
-        kind, value = kinds[attribute], getattr(settings, attribute)
+        kind = kinds[attribute]
+        value = getattr(settings, attribute)
         names = [getattr(extra, "name", None) for extra in getattr(kind, "__metadata__", ())]
         name = next((each for each in names if isinstance(each, str)), attribute)
         yield attribute, prefix + name + "." * (is_dataclass(value) and name != ""), kind, value

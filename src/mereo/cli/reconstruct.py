@@ -195,7 +195,8 @@ def reconstruct_frame(frame: SensorFrame, directory: Path, job: FrameJob, path: 
 
 def run(command: ReconstructCommand) -> Outcome:
     """Write the folder of results and print the segments."""
-    cluster, inference = choose_cluster(command.ray, command.threads, command.task), command.inference
+    cluster = choose_cluster(command.ray, command.threads, command.task)
+    inference = command.inference
     if cluster is not None and command.weights is not None:
         from mereo.models.weights import settings_for
 
@@ -314,7 +315,8 @@ def _print_table(frames: Sequence[tuple[Path, Path]], summaries: Mapping[Path, S
         if summary is None:
             table.add_row(file.name, "none")
             continue
-        fit, segments = summary.get("registration", {}), summary["segments"]
+        fit = summary.get("registration", {})
+        segments = summary["segments"]
         table.add_row(
             file.name,
             "registered model" if fit else "network",
@@ -399,7 +401,8 @@ def _answer_in_tasks(
         except Exception as problem:
             return path, folder, problem
 
-    work, contents = _Answering(job, cluster.gpus > 0), (read(*frame) for frame in frames)
+    work = _Answering(job, cluster.gpus > 0)
+    contents = (read(*frame) for frame in frames)
     with closing(spread(work, contents, cluster, lambda _, error: error)) as answers:
         for (path, folder, _), answered in answers:
             yield path, partial(_write_answer, path, folder, answered, job)
@@ -453,7 +456,9 @@ def print_uncertainty(registered: Registration | None, unit: Unit) -> None:
 
 def print_segments(result: Result) -> None:
     """Print a table of the segments, and a line of the stages' seconds."""
-    reconstruction, seen, unit = result.reconstruction, result.seen, Unit(result.unit_m)
+    reconstruction = result.reconstruction
+    seen = result.seen
+    unit = Unit(result.unit_m)
     table = Table(title=f"{seen.frame.source}, {len(seen.cloud)} points", title_justify="left")
     table.add_column("segment")
     has_confidence = not all(np.isnan(segment.confidence) for segment in reconstruction.segments)

@@ -227,7 +227,8 @@ class SceneRecord:
 
         seed = training_seed(self.seed, self.test)
         with new_directory(self.output, self.force, files_of(self.scene)) as folder:
-            scene, sensor = load_scene(self.scene), (self.sensor, SENSORS[self.sensor])
+            scene = load_scene(self.scene)
+            sensor = (self.sensor, SENSORS[self.sensor])
             write_recording(folder, scene, self.settings, sensor, seed, named=self.scene)
         print(f"wrote {self.output}: {self.settings.frames} frames in {self.settings.seconds:g} s; then:")
         command = f"mereo stream {shlex.quote(str(self.output))} --rate {self.settings.rate:g}"

@@ -132,7 +132,9 @@ def stream(
     arriving = each if every_frame else _latest(source)
     with closing(arriving):
         for frame, arrived_s, dropped in arriving:
-            start, result, error = time.perf_counter(), None, ""
+            start = time.perf_counter()
+            result = None
+            error = ""
             try:
                 result = answer(frame)
             except Exception as problem:  # a damaged frame makes the libraries that parse it raise anything
@@ -142,7 +144,8 @@ def stream(
 
 
 def _paced(frames: Iterable[StreamFrame | None]) -> Frames:
-    start, zero = time.perf_counter(), None
+    start = time.perf_counter()
+    zero = None
     for frame in frames:
         if frame is not None:
             zero = frame.time_s if zero is None else zero
@@ -153,7 +156,8 @@ def _paced(frames: Iterable[StreamFrame | None]) -> Frames:
 def _latest(frames: Frames) -> Generator[Arrived, None, None]:
     """Frames that a thread brings, of those that came since the last one only the newest."""
     waiting: queue.Queue[Arrived | Exception | None] = queue.Queue(maxsize=1)
-    is_left, reported = threading.Event(), 0
+    is_left = threading.Event()
+    reported = 0
 
     def bring() -> None:
         end: Exception | None = None
@@ -329,7 +333,8 @@ def watched_frames(source: str, reading: InputConfig, isolation: IsolationConfig
         raise FileNotFoundError(f"{path} does not exist; a folder that can be watched is needed: make it first")
     if not path.is_dir() or is_recording(path):
         raise ValueError(f"{source} is no folder of frames; only such a folder can be watched: leave out --watch")
-    folder, start = WatchedFolder(path, lambda file: _is_frame(file, reading)), time.perf_counter()
+    folder = WatchedFolder(path, lambda file: _is_frame(file, reading))
+    start = time.perf_counter()
 
     def arriving() -> Frames:
         while True:
@@ -399,7 +404,9 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
             f"{source} is a camera, which waits for no answer: leave out --every-frame, or record it first"
         )
     folder = None if command.surfaces is None else SurfaceFolder(command.surfaces, command.force)
-    joints, topic, steady = command.joints, None, None
+    joints = command.joints
+    topic = None
+    steady = None
     if joints is not None and is_recording(Path(source)) and not joints.exists():
         topic = str(joints)
     frames: Iterable[StreamFrame | None] = (
@@ -423,7 +430,9 @@ def stream_reconstructions(command: StreamCommand) -> Summary:
     )
     # what a camera delivers, or is written to standard input or into a watched folder, arrives when it does
     pace = not (every_frame or command.watch or source == STANDARD_INPUT or is_live(source))
-    summary, last_error, is_stopped = Summary(), "", False
+    summary = Summary()
+    last_error = ""
+    is_stopped = False
     broken_off: Exception | None = None
     with closing(answer):
         try:
@@ -498,7 +507,8 @@ class FrameAnswer:
             "pose": None,
             "joints": {},
         }
-        strays, segments = answer.hypothesis.dropped, dict[str, JsonObject]()
+        strays = answer.hypothesis.dropped
+        segments = dict[str, JsonObject]()
         if is_missing:
             return cls(None, {**facts, "strays": strays, "segments": segments})
         mesh = answer.surfaces

@@ -72,7 +72,8 @@ class Align:
         scan = ScanFile(self.scan, self.unit, self.frame, self.drop_invalid)
         with new_directory(self.output, self.force, [self.scan, *files_of(self.scene), self.start]) as directory:
             scene = load_scene(self.scene)
-            rest, unit_m = scene.rest, scene.unit_m if self.scene_unit_mm is None else self.scene_unit_mm / 1000
+            rest = scene.rest
+            unit_m = scene.unit_m if self.scene_unit_mm is None else self.scene_unit_mm / 1000
             cloud = read_point_cloud(self.scan, self.drop_invalid)
             scale = None if unit_m is None else unit_m / UNITS_M[self.unit]
             start = read_start(self.start, rest, scale)

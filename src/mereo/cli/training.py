@@ -127,7 +127,8 @@ class DatasetShow:
         from mereo_learning.shards import expected_files, read_manifest
 
         manifest = read_manifest(self.dataset)
-        files, names = expected_files(manifest), names_in(self.dataset)
+        files = expected_files(manifest)
+        names = names_in(self.dataset)
         facts = {
             "dataset": self.dataset,
             "scene": f"{manifest['scene']}, of {', '.join(segment['name'] for segment in manifest['segments'])}",

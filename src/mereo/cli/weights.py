@@ -71,7 +71,8 @@ class WeightsShow:
         from mereo.scenes.scene import SourceFrame
 
         path, header = read_facts(self.weights)
-        content, card = path.read_bytes(), path.with_suffix(".md")
+        content = path.read_bytes()
+        card = path.with_suffix(".md")
         digest = sha256(content).hexdigest()
         frame = SourceFrame.of_facts((header.get("states") or {}).get("frame"))
         unit_m = None if frame is None else frame.unit_m

@@ -109,7 +109,8 @@ class ElasticSolid:
     @property
     def mass(self) -> Values:
         """Filled volume that belongs to each node, above 0."""
-        corners, shares = self.mesh.elements.ravel(), np.repeat(self.volumes / 4, 4)
+        corners = self.mesh.elements.ravel()
+        shares = np.repeat(self.volumes / 4, 4)
         return np.bincount(corners, weights=shares, minlength=len(self.mesh.nodes))
 
     @property
@@ -122,7 +123,8 @@ class ElasticSolid:
         """Number of pieces; tetrahedra are of one where a chain of common faces joins them."""
         faces = np.sort(self.mesh.elements[:, [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]]].reshape(-1, 3), axis=1)
         number = np.unique(faces, axis=0, return_inverse=True)[1].ravel()
-        rows, count = np.repeat(np.arange(len(self.mesh.elements)), 4), len(self.mesh.elements)
+        rows = np.repeat(np.arange(len(self.mesh.elements)), 4)
+        count = len(self.mesh.elements)
         incidence = coo_array((np.ones(len(rows)), (rows, number)), (count, int(number.max()) + 1)).tocsr()
         return int(connected_components(incidence @ incidence.T, directed=False)[0])
 
@@ -198,7 +200,8 @@ def find_modes(solid: ElasticSolid, count: int, material: Material, held: Flags 
     Raises ``ValueError`` where there are not so many modes, for a solid that is not in one piece, and where what is
     held leaves it free to turn.
     """
-    stiffness, mass = assemble_stiffness(solid, material), solid.mass
+    stiffness = assemble_stiffness(solid, material)
+    mass = solid.mass
     rigid, free = (6, np.ones(len(mass), bool)) if held is None else (0, ~held)
     rows = np.flatnonzero(np.repeat(free, 3))
     most = solid.most_modes(held)
@@ -256,7 +259,8 @@ class StateMap:
         mesh = solid.mesh
         self.mesh, self.modes = mesh, read_only_view(modes)
         weighted = mesh.shape_gradients * solid.volumes[:, None, None]
-        count, rows = len(mesh.nodes), np.repeat(mesh.elements, 3, axis=1).ravel()
+        count = len(mesh.nodes)
+        rows = np.repeat(mesh.elements, 3, axis=1).ravel()
         columns = np.arange(3 * len(mesh.elements)).reshape(-1, 1, 3).repeat(4, axis=1).ravel()
         shape = (count, 3 * len(mesh.elements))
         self._divergence: csr_array = coo_array((weighted.ravel(), (rows, columns)), shape).tocsr()
@@ -322,7 +326,8 @@ class ElasticSampler:
     @cached_property
     def digest(self) -> str:
         """Digest of all that decides the modes but for their scale."""
-        mesh, digest = self.solid.mesh, hashlib.sha256(f"{self.material} {self.count}".encode())
+        mesh = self.solid.mesh
+        digest = hashlib.sha256(f"{self.material} {self.count}".encode())
         for part in (mesh.nodes, mesh.elements, self.solid.filled, self.solid.stiffness, self.held):
             digest.update(b"none" if part is None else np.ascontiguousarray(part).tobytes())
         return digest.hexdigest()

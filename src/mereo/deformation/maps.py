@@ -212,7 +212,9 @@ def newton(deformation: Deformation, points: Points, guess: Points) -> tuple[Poi
     (Any decrease would not do: a point can run away along one axis while it gains along another.)
     """
     tolerance = TOLERANCE * max(_magnitude(points), _magnitude(guess))
-    rest, full, scale = guess.astype(float), np.zeros(points.shape), np.ones(len(points))
+    rest = guess.astype(float)
+    full = np.zeros(points.shape)
+    scale = np.ones(len(points))
     error = np.full(len(points), np.inf)
     active = np.arange(len(points))
     for _ in range(ITERATIONS):

@@ -84,7 +84,8 @@ class Tetrahedra:
     def _node_mean(self) -> csr_array:
         """From values of tetrahedra to their means at nodes, weighted by volume."""
         weight = np.repeat(np.abs(self.volumes), 4)
-        rows, columns = self.elements.ravel(), np.repeat(np.arange(len(self.elements)), 4)
+        rows = self.elements.ravel()
+        columns = np.repeat(np.arange(len(self.elements)), 4)
         total = np.bincount(rows, weights=weight, minlength=len(self.nodes))
         return coo_array((weight / total[rows], (rows, columns)), (len(self.nodes), len(self.elements))).tocsr()
 
@@ -176,7 +177,8 @@ class TetrahedralMap:
         elements = self.rest.elements
         element = _locate(search_tree(self.nodes, elements), self.nodes, elements, points)
         inside = element >= 0
-        rest, converged = np.empty_like(points, float), inside.copy()
+        rest = np.empty_like(points, float)
+        converged = inside.copy()
         first = elements[element[inside], 0]
         back = inv(self._gradients[element[inside]])
         rest[inside] = self.rest.nodes[first] + _apply(back, points[inside] - self.nodes[first])

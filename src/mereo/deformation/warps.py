@@ -59,7 +59,9 @@ class Bend:
         # of the arc: (sin a / k, (1 - cos a) / k), written so that it holds for curvature zero
         half = np.sinc(angle / (2 * pi))
         x, y = s * half * np.cos(angle / 2), s * half * np.sin(angle / 2)
-        cosine, sine, beyond = np.cos(angle), np.sin(angle), along - s
+        cosine = np.cos(angle)
+        sine = np.sin(angle)
+        beyond = along - s
         new_along = x + beyond * cosine - offset * sine
         new_offset = y + beyond * sine + offset * cosine
         return points + np.outer(new_along - along, axis) + np.outer(new_offset - offset, side)
@@ -121,7 +123,8 @@ class Squash:
 
     def __call__(self, points: Points) -> Points:
         """Images of points, in the points' unit."""
-        axis, across = unit(self.axis), self.factor**-0.5
+        axis = unit(self.axis)
+        across = self.factor**-0.5
         matrix = across * np.eye(3) + (self.factor - across) * np.outer(axis, axis)
         return self.center + (points - self.center) @ matrix
 
@@ -262,7 +265,8 @@ def transport_frames(tangents: Float[ndarray, "m 3"], normal: Vector) -> Float[n
     et al., "Discrete elastic rods", 2008).
     """
     a, b = tangents[:-1], tangents[1:]
-    cross, cosine = np.cross(a, b), np.einsum("ni,ni->n", a, b)
+    cross = np.cross(a, b)
+    cosine = np.einsum("ni,ni->n", a, b)
     skew = crossing(cross)
     turns = np.eye(3) + skew + skew @ skew / (1.0 + cosine)[:, None, None]
     normal = unit(normal - (normal @ tangents[0]) * tangents[0])

@@ -50,7 +50,8 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
         is_over = best.explains(problem) or best.misfit.cloud > HOPELESS
         if is_over or (problem.is_noisy and problem.share_on(best.surface) < problem.accepted):
             break
-        before, z = best, best.posed.z
+        before = best
+        z = best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
         for _, posed in bend_by_few(problem, starts, 3)[:3]:
             best = min(best, refined(problem, fit_wide(problem, posed)), key=lambda scored: scored.misfit.total)
@@ -71,7 +72,9 @@ def bend_by_few(problem: Problem, states: list[Posed], kept: int) -> list[tuple[
 
     Half of them after each stage, and ``kept`` at least.
     """
-    coarse, whole, cost = problem.coarse, Prior.whole(problem.model), list[float]()
+    coarse = problem.coarse
+    whole = Prior.whole(problem.model)
+    cost = list[float]()
     for start, steps, sigma in BENDING:
         states = [fit_cloud(coarse, posed, whole, start, steps, PAIR_SLACK) for posed in states]
         cost = [coarse.screen(posed, sigma * problem.model.half).total for posed in states]
@@ -145,7 +148,8 @@ def robust_poses(
     equal = np.full(len(target), 1 / len(target), dtype=np.float32)
     share = np.broadcast_to(equal, states.shape[:2])
     for _ in range(4):
-        center, goal = np.matmul(share[:, None], states), (share @ target)[:, None]
+        center = np.matmul(share[:, None], states)
+        goal = (share @ target)[:, None]
         covariance = np.matmul((states - center).transpose(0, 2, 1) * share[:, None], target - goal)
         rotation = best_rotations(covariance)
         squared = ((np.matmul(states - center, rotation.transpose(0, 2, 1)) + goal - target) ** 2).sum(axis=2)
@@ -167,7 +171,8 @@ def robust_poses(
 
 def fit_rest(problem: Problem, modes: Posed) -> ScoredFit:
     """Fit the rest model's pose from that of the modes; its ``posed.z`` is empty."""
-    model, rest = problem.model, of_rest(problem)
+    model = problem.model
+    rest = of_rest(problem)
     T = fit_rigid(model.rest_points, modes.place(model.material(modes.z)))
     start = Posed(T[:3, :3], T[:3, 3], np.empty(0), modes.log_scale)
     return lowered(rest, fit_cloud(rest, start, Prior.whole(rest.model), REFINE_SIGMA, 10, 0.0))
@@ -187,7 +192,8 @@ def resting(problem: Problem, modes: ScoredFit) -> ScoredFit | None:
     """
     if not problem.model.rests:
         return None
-    rest, is_rigid = fit_rest(problem, modes.posed), problem.model.count == 0
+    rest = fit_rest(problem, modes.posed)
+    is_rigid = problem.model.count == 0
     is_better = is_rigid or rest.misfit.total - modes.misfit.total < narrowing(problem, modes.posed)
     return rest if is_better else None
 
@@ -219,7 +225,8 @@ GAIN = 1.0
 
 def lowered(problem: Problem, posed: Posed) -> ScoredFit:
     """Descend by steps that lower the misfit (Levenberg and Marquardt)."""
-    best, prior = ScoredFit.of(problem, posed), Prior.whole(problem.model)
+    best = ScoredFit.of(problem, posed)
+    prior = Prior.whole(problem.model)
     for damping in (DAMPING, 30.0 * DAMPING):
         gain = np.inf
         while gain > GAIN:

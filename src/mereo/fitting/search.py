@@ -128,8 +128,10 @@ class ShapeTables:
 
     def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> "Samples":
         """Samples near points of each pose's model frame, and its ``places``."""
-        state, places = poses.state[:, None], self.places(poses)
-        sample, still = self.looked_up(state, seen), np.zeros((len(seen), 1, 6, 0), dtype=np.float32)
+        state = poses.state[:, None]
+        places = self.places(poses)
+        sample = self.looked_up(state, seen)
+        still = np.zeros((len(seen), 1, 6, 0), dtype=np.float32)
         owner, few_owner = (np.zeros(part.shape[:2], dtype=int) for part in (seen, places))
         return Samples(self.position[state, sample], self.normal[state, sample], owner, places, few_owner, still)
 
@@ -171,10 +173,12 @@ class MechanismTables(ShapeTables):
     @classmethod
     def of_joints(cls, states: ShapeTables, surface: SampledMechanism) -> "MechanismTables":
         """Tables of states, and of the segments of samples."""
-        mechanism, none = surface.mechanism, np.zeros((1, 0), dtype=np.float32)
+        mechanism = surface.mechanism
+        none = np.zeros((1, 0), dtype=np.float32)
         order = np.argsort(surface.owner, kind="stable")
         frame, owner = surface.mean[order], surface.owner[order]
-        rest, normal = frame[:, 0], unit_rows(cross(frame[:, 1], frame[:, 2]))
+        rest = frame[:, 0]
+        normal = unit_rows(cross(frame[:, 1], frame[:, 2]))
         parts = {int(each): owner == each for each in np.unique(owner)}
         segments = {
             each: ShapeTables.tabulate(none, rest[None, rows], normal[None, rows], mechanism.half)
@@ -185,29 +189,36 @@ class MechanismTables(ShapeTables):
     def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> Samples:
         """Samples near points of each pose's model frame, of the segments that come nearest, and its ``places``."""
         T, twists = (part.astype(np.float32) for part in self.mechanism.motions(poses.z))
-        alone, nearest = np.zeros((len(seen), 1), dtype=int), np.full(seen.shape[:2], np.inf, dtype=np.float32)
-        sample, first = np.zeros(seen.shape[:2], dtype=int), 0
+        alone = np.zeros((len(seen), 1), dtype=int)
+        nearest = np.full(seen.shape[:2], np.inf, dtype=np.float32)
+        sample = np.zeros(seen.shape[:2], dtype=int)
+        first = 0
         for number, table in self.segments.items():
             local = np.matmul(seen - T[:, number, None, :3, 3], T[:, number, :3, :3])
             row = first + table.looked_up(alone, local)
             offset = local - self.rest[row]
             squared = np.einsum("npi,npi->np", offset, offset)
             sample = np.where(squared < nearest, row, sample)
-            nearest, first = np.minimum(nearest, squared), first + table.position.shape[1]
+            nearest = np.minimum(nearest, squared)
+            first = first + table.position.shape[1]
         few = self._few(len(seen))
-        near, places = self._motions(T, sample), placed(self._motions(T, few), self.rest[few])
+        near = self._motions(T, sample)
+        places = placed(self._motions(T, few), self.rest[few])
         normal = np.einsum("npij,npj->npi", near[..., :3, :3], self.rest_normal[sample])
         return Samples(placed(near, self.rest[sample]), normal, self.owner[sample], places, self.owner[few], twists)
 
     def near(self, pose: "Poses", count: int, rng: np.random.Generator) -> "Poses":
         """Poses of states near one: all joints turned a little, or one of them anywhere, with most of it in place."""
-        joints, many = len(self.mechanism.free), pose.rows(np.zeros(count, dtype=int))
+        joints = len(self.mechanism.free)
+        many = pose.rows(np.zeros(count, dtype=int))
         step, anywhere = rng.standard_normal((2, count, joints))
         is_single = np.arange(joints) == rng.integers(max(joints, 1), size=(count, 1))
-        single, little = np.where(is_single, anywhere, pose.z), pose.z + NEAR * step
+        single = np.where(is_single, anywhere, pose.z)
+        little = pose.z + NEAR * step
         z = np.where(np.arange(count)[:, None] % 2, single, little).astype(np.float32)
         bent = replace(many, z=z)
-        target, states = self.places(pose)[0], self.places(bent)
+        target = self.places(pose)[0]
+        states = self.places(bent)
         _, rotation, translation = robust_poses(states, target, AGREES * self.mechanism.half)
         return replace(
             bent,
@@ -217,7 +228,8 @@ class MechanismTables(ShapeTables):
 
     def places(self, poses: "Poses") -> Float32[np.ndarray, "n w 3"]:
         """Positions of samples of each pose's state, evenly spread, as many as points that it is compared with."""
-        few, T = self._few(len(poses)), self.mechanism.motions(poses.z)[0].astype(np.float32)
+        few = self._few(len(poses))
+        T = self.mechanism.motions(poses.z)[0].astype(np.float32)
         return placed(self._motions(T, few), self.rest[few])
 
     def _few(self, count: int) -> Int[np.ndarray, "n w"]:
@@ -338,7 +350,8 @@ class SightTable:
         T = rotation_along(direction.mean(axis=0) / np.linalg.norm(direction.mean(axis=0))).T
         turned = evidence.points @ T.T
         slope = turned[:, :2] / np.maximum(turned[:, 2:], 0.1 * np.linalg.norm(turned, axis=1, keepdims=True))
-        low, high = slope.min(axis=0), slope.max(axis=0)
+        low = slope.min(axis=0)
+        high = slope.max(axis=0)
         side = 3.0 * float((high - low).max()) + 4 * evidence.pitch
         corner = (low + high - side) / 2
         cells = min(96, max(16, int(side / evidence.pitch)))
@@ -615,7 +628,8 @@ def _normal_equations(
 
 def _moved(poses: Poses, matrix: Float[np.ndarray, "n q q"], gradient: Float[np.ndarray, "n q"], scaled: bool) -> Poses:
     """Poses after the step of the normal equations."""
-    matrix, gradient = matrix.astype(np.float64), gradient.astype(np.float64)
+    matrix = matrix.astype(np.float64)
+    gradient = gradient.astype(np.float64)
     free = np.delete(np.arange(gradient.shape[1]), [] if scaled else 6)  # without the scale
     matrix = matrix[:, free][:, :, free]
     step = np.zeros_like(gradient)
@@ -686,7 +700,8 @@ KEPT = 4
 SHAKEN_FITS = 3
 """Fits that differ, around each of which states are tried in each round."""
 
-HEAVIER_STEPS, HELPS = (0.04, 12), 0.65
+HEAVIER_STEPS = (0.04, 12)
+HELPS = 0.65
 """First sigma and steps of the fit of an elastic solid whose cloud weighs as others', and the share of the misfit that
 may be left: bends of a bunny's ears leave .45 to .54, states of livers .77 up."""
 
@@ -806,7 +821,8 @@ class Trail:
         model, best = self.problem.model, self.best
         rivals = sorted((fit for fit in self.fitted if _total(fit) <= ALIKE * _total(best)), key=_total)
         rows = differing(self.problem, [fit.posed for fit in rivals], APART)[1:]
-        others, vertices = [rivals[row].surface.material for row in rows], model.silhouette_vertices
+        others = [rivals[row].surface.material for row in rows]
+        vertices = model.silhouette_vertices
         solids = Solids(model.mesh(best.surface.material))
         apart = (np.quantile(solids.nearest(each[vertices]).distance, MOST_PLACES) for each in others)
         return tuple(each for each, far in zip(others, apart, strict=True) if far > SAME * model.half)

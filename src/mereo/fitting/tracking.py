@@ -144,7 +144,8 @@ def next_fit(
     began; where it was seen whole and the frame rules that out by more than ``WHOLE``, it is fitted as seen in part
     too, and the better fit is taken.
     """
-    started, lines = time.perf_counter(), cloud.lines
+    started = time.perf_counter()
+    lines = cloud.lines
     with limit_blas_threads():
         start = track.expected(time_s, config)
         precision = motion_precision(track, max(time_s - track.time_s, 0.0), config)
@@ -169,7 +170,8 @@ def followed(track: Track, fitted: ModesFit, time_s: float, config: TrackConfig)
     """Track with a further frame."""
     posed, scale = without_scale(fitted.posed)
     passed = max(time_s - track.time_s, 1e-3)
-    before, left = track.problem.noise, fitted.problem.left_noise(fitted.surface)
+    before = track.problem.noise
+    left = fitted.problem.left_noise(fitted.surface)
     return replace(
         track,
         problem=fitted.problem.with_noise(before + config.smoothing * (left - before)),
@@ -203,7 +205,8 @@ def descend(problem: Problem, start: Posed, precision: Float[np.ndarray, "p p"],
     """State that explains cloud, silhouette and prior from nearby, and lies near ``start``, which is expected."""
     half = problem.model.half
     prior = Prior.near(problem.model, start.z) if are_near(problem.model) else Prior.whole(problem.model)
-    posed, steps = start, config.steps + config.exact_steps
+    posed = start
+    steps = config.steps + config.exact_steps
     for step in range(steps):
         sigma = max(config.first_sigma * half * config.cooling**step, problem.cloud_sigma)
         expected = NormalEquations(precision, precision @ between(start, posed))
@@ -363,7 +366,8 @@ class Tracker:
         The first frame is waited for, however long a search takes. Raises ``ValueError`` where that is unusable or
         shows too little; of later frames the object is then lost, and the track is kept.
         """
-        started, frame = time.perf_counter(), TrackedFrame(seen, time_s, scene_unit, keep_all, scene)
+        started = time.perf_counter()
+        frame = TrackedFrame(seen, time_s, scene_unit, keep_all, scene)
         tracked, why = self._tracked(self._track, frame, self.config.longest_s)
         if tracked is not None and not self._doubt(tracked):
             return self._gone_on(frame, tracked, started)
@@ -393,7 +397,8 @@ class Tracker:
         keep = np.ones(len(points), dtype=bool) if frame.keep_all else gated(track, points, time_s, self.config)
         if keep.sum() < MIN_POINTS:
             return None, f"{counted(int(keep.sum()), 'point')} of at least {MIN_POINTS} lie near where it was expected"
-        lines, kept = seen.lines.transformed(self._T_camera_input), cloud.rows(keep)
+        lines = seen.lines.transformed(self._T_camera_input)
+        kept = cloud.rows(keep)
         near = CloudToFit(kept.points, outliers=points[~keep], lines=lines, normals=kept.normals)
 
         def fit(config: TrackConfig) -> _Tracked:
@@ -423,7 +428,8 @@ class Tracker:
 
     def _by_itself(self, frame: TrackedFrame, started: float) -> Answer | None:
         """Answer a frame by itself, which begins a track; None where nothing explains it."""
-        registrar, config = self.registrar.narrowed(frame.scene), self.config
+        registrar = self.registrar.narrowed(frame.scene)
+        config = self.config
         seen, candidate = self.locate(frame, registrar)
         self._has_begun = True
         if candidate.modes is None:

@@ -147,7 +147,8 @@ class Posterior:
     @cached_property
     def _local(self) -> tuple[Float32[np.ndarray, "r p"], Float32[np.ndarray, "k p"]]:
         """Factor in axes that turn with the object: its rows of the pose, and of the coefficients with the scale."""
-        turned, rotation = self.factor.copy(), self.posed.rotation
+        turned = self.factor.copy()
+        rotation = self.posed.rotation
         turned[:3], turned[3:6] = rotation.T @ self.factor[:3], rotation.T @ self.factor[3:6]
         turned[POSE:] *= np.exp(self.posed.log_scale)
         return turned[:POSE].astype(np.float32), turned[POSE:].astype(np.float32)
@@ -189,7 +190,8 @@ class Posterior:
         express (``residue``) is left out: over a segment it averages out.
         """
         pose, state = self._local
-        turned, count = (gradient @ self.posed.rotation).astype(np.float32), gradient.shape[1]
+        turned = (gradient @ self.posed.rotation).astype(np.float32)
+        count = gradient.shape[1]
         flat = turned.reshape(len(turned), -1)
         each: np.ndarray = flat @ rigid_motion(self._arm[:count]).reshape(-1, POSE) @ pose
         if len(state):
@@ -266,7 +268,8 @@ class ModesOptimum:
     def posterior(self) -> Posterior:
         """Posterior of pose, scale and coefficients."""
         model = self.problem.model
-        material, tangent = self.posed.place(model.material(self.posed.z)), model.tangent(self.posed.z)
+        material = self.posed.place(model.material(self.posed.z))
+        tangent = model.tangent(self.posed.z)
         with limit_blas_threads():
             open = [turns_left_open(self.problem, material)]
             open += [] if self.bent is None else [(self.bent - material)[:, :, None]]
@@ -487,7 +490,8 @@ class Uncertainty:
     @cached_property
     def segments(self) -> tuple[SegmentUncertainty, ...]:
         """Each segment's, of the volume that belongs to it, without that of segments nested in it."""
-        unit, result = self.optimum.unit, list[SegmentUncertainty]()
+        unit = self.optimum.unit
+        result = list[SegmentUncertainty]()
         volumes, motion, parts = self._owned
         for name, volume, moved, radius in zip(self.model.rest.names, volumes, motion, self._of(parts), strict=True):
             off = WITHIN * self.factor * float(np.linalg.norm(moved[0]))
@@ -522,7 +526,8 @@ class Uncertainty:
     ) -> Explanation:
         """What decides a position that moves so; ``T_registration_fit`` leads from the fit's frame, in input units."""
         (rows, pulls, parts), motion, unit = self._whitened, motion.astype(np.float64), self.optimum.unit
-        whole, influence = float((motion**2).sum()), pulls @ motion.T
+        whole = float((motion**2).sum())
+        influence = pulls @ motion.T
         shares: dict[Evidence, float] = {"points": float((influence * (rows @ motion.T)).sum()) / whole}
         shares |= {name: float(((motion @ part) * motion).sum()) / whole for name, part in parts.items()}
         length = np.linalg.norm(influence, axis=1)

@@ -34,7 +34,8 @@ def thin_to_grid(points: Points, limit: int) -> Subset:
     """
     if len(points) <= limit:
         return np.arange(len(points))
-    low, side = points.min(axis=0), longest_side(points)
+    low = points.min(axis=0)
+    side = longest_side(points)
     if side == 0:
         return np.arange(limit)
     # a surface through a cube of c^3 cells occupies about c^2 of them

@@ -69,7 +69,8 @@ def nodes_of(cells: CellFlags) -> VoxelMask:
 
 def zero_surface(field: Float[ndarray, "x y z"]) -> tuple[Points, AnyFaces]:
     """Vertices, in steps of the grid, and faces of the surface where a field is 0; they face where it is negative."""
-    inside, doubled = field > 0, tuple(2 * size for size in field.shape)
+    inside = field > 0
+    doubled = tuple(2 * size for size in field.shape)
     cells = np.argwhere(changing_cells(inside))
     positive = inside[tuple(np.moveaxis(cells[:, None] + CORNERS, 2, 0))]
     turned = _turned(cells, positive, field.shape)

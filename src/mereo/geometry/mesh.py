@@ -231,7 +231,9 @@ class SegmentedMesh:
 
 def check_segment(segment: Segment) -> None:
     """Raise ``ValueError`` naming the segment, the rule it breaks and the cure."""
-    faces, count, fault = segment.faces, len(segment.vertices), ""
+    faces = segment.faces
+    count = len(segment.vertices)
+    fault = ""
     if len(faces) == 0:
         fault = "no faces; it must be a closed mesh: check the exported part"
     elif not np.isfinite(segment.vertices).all():

@@ -152,7 +152,8 @@ def _encloses_nothing(vertices: AnyPoints, faces: AnyFaces) -> bool:
 def _wrong_edges(vertices: AnyPoints, faces: AnyFaces, unit: str) -> tuple[int, list[str]]:
     """Number of open edges, and phrases on them and on edges of too many faces or of faces that disagree."""
     ends, uses, unbalanced = edge_uses(faces)
-    faults, rim = [], ends[uses == 1]
+    faults = []
+    rim = ends[uses == 1]
     if len(rim):
         _, loop = np.unique(connected(rim, len(vertices))[rim[:, 0]], return_inverse=True)
         longest = rim[loop == np.bincount(loop).argmax()]
@@ -331,7 +332,9 @@ def overlaps(
     touch share no volume. Segments may be no solids, so their boxes say which of two is smaller. The test is limited to
     the pairs of indices ``among``, the lower one first.
     """
-    bodies, nesting, names = [_Body(segment) for segment in mesh.segments], set(mesh.nesting), mesh.names
+    bodies = [_Body(segment) for segment in mesh.segments]
+    nesting = set(mesh.nesting)
+    names = mesh.names
     order = sorted(range(len(bodies)), key=lambda index: bodies[index].box_volume)
     chosen = combinations(order, 2) if among is None else (sorted(pair, key=order.index) for pair in sorted(among))
     pairs = []

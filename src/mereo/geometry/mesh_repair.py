@@ -66,7 +66,8 @@ def repaired(segment: Segment, unit: str = "") -> Repair:
 
     Raises ``ValueError`` where nothing is left to work with.
     """
-    health, lost = examine(segment), f"segment {segment.name!r} has no surface that could be repaired: export it again"
+    health = examine(segment)
+    lost = f"segment {segment.name!r} has no surface that could be repaired: export it again"
     if health.sound:
         return Repair(segment, (), segment)
     if not health.mendable:
@@ -105,7 +106,9 @@ def _drop_unusable(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
 def _merge_near(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
     """Vertices of open edges that are nearly the same, where that closes edges."""
     diagonal = float(norm(np.ptp(vertices, axis=0)))
-    best, fewest, change = (vertices, faces), len(open_edges(vertices, faces)), ""
+    best = (vertices, faces)
+    fewest = len(open_edges(vertices, faces))
+    change = ""
     for distance in (share * diagonal for share in MERGED_WITHIN):
         if fewest:
             merged = _merged(vertices, faces, distance)
@@ -138,7 +141,8 @@ def _orient(vertices: AnyPoints, faces: AnyFaces, unit: str) -> Step:
         return vertices, faces, ""
     turned, patch = igl.bfs_orient(faces.astype(np.int64))
     turned = turned.astype(np.int64)  # C's long long, which numpy tells apart
-    corners, count = vertices[turned], np.bincount(patch)
+    corners = vertices[turned]
+    count = np.bincount(patch)
     middle = np.stack([np.bincount(patch, corners[:, :, k].mean(axis=1)) for k in range(3)], axis=1) / count[:, None]
     a, b, c = np.moveaxis(corners - middle[patch, None], 1, 0)  # about its middle, so that holes matter little
     inwards = (np.bincount(patch, np.einsum("ij,ij->i", a, np.cross(b, c))) < 0)[patch]
@@ -311,7 +315,10 @@ def _with_thin_parts(body: _Body, solid: Manifold) -> tuple[Manifold, float, tup
 
     What is thin breaks into dashes before it vanishes. They are near it, so shells of few cells do not count.
     """
-    cell, faces, centres, last = 1.0, np.arange(len(body.faces)), None, LEVELS
+    cell = 1.0
+    faces = np.arange(len(body.faces))
+    centres = None
+    last = LEVELS
     for level in range(LEVELS + 1):
         places, normals, face = body.samples(faces, 2.0 * FINER**-level, centres)
         whole = _without_specks(solid, 8.0 * FINER**-level)
@@ -327,10 +334,13 @@ def _with_thin_parts(body: _Body, solid: Manifold) -> tuple[Manifold, float, tup
             chosen = np.flatnonzero(_within(places, places[resolved], 2.0) & (way > 0.5 * FINER * finer))
             blocks = _blocks(places[chosen], way[chosen], 16 * finer, FINER * finer)
             if len(blocks) > MOST_BLOCKS:  # of finer cells there would be even more
-                blocks, last = blocks[:MOST_BLOCKS], level + 1
-            cube, corners = Manifold.cube((16 * finer,) * 3), (blocks * 16 * finer).tolist()
+                blocks = blocks[:MOST_BLOCKS]
+                last = level + 1
+            cube = Manifold.cube((16 * finer,) * 3)
+            corners = (blocks * 16 * finer).tolist()
             region = Manifold.batch_boolean([cube.translate(c) for c in corners], OpType.Add)
-            solid, cell = (whole - region) + (_fine_surface(body, blocks, finer) ^ region), finer
+            solid = (whole - region) + (_fine_surface(body, blocks, finer) ^ region)
+            cell = finer
     worst = int(np.where(seeds, way, -1.0).argmax())
     lost = (float(way[worst]), places[worst]) if seeds.any() else None
     return whole.simplify(0.01 * cell) if cell < 1 else solid, cell, lost
@@ -396,7 +406,8 @@ def _cut_off(body: _Body, solid: Manifold, places: AnyPoints, normals: AnyPoints
 
 # --- fewer faces ------------------------------------------------------------------------------------------------------
 
-MOST_FACES, WITHIN = 100_000, (2.5e-4, 5e-4, 1e-3)
+MOST_FACES = 100_000
+WITHIN = (2.5e-4, 5e-4, 1e-3)
 """Faces of a solid that all later work takes as they are; how far simpler ones may be, in longest sides: the first that
 leaves few enough, else the last."""
 

@@ -218,7 +218,8 @@ class Solids:
         outside = (np.maximum(np.maximum(each.low - points, points - each.high), 0.0) for each in self._solids)
         bounds = np.stack([np.einsum("ij,ij->i", offset, offset) for offset in outside])
         likely = bounds.argmin(axis=0)
-        squared, place = np.full(len(points), inf), np.empty_like(points)
+        squared = np.full(len(points), inf)
+        place = np.empty_like(points)
         face, owner = np.empty(len(points), np.int64), np.empty(len(points), np.int64)
         first_faces = np.cumsum([0, *(len(solid.faces) for solid in self._solids)])
         # first the segment whose box is nearest, then those whose boxes are nearer than what it gave: one to two each
@@ -345,7 +346,8 @@ def _covered_columns(
     corners: Float[ndarray, "f 3 2"], x: Float[ndarray, " nx"], y: Float[ndarray, " ny"]
 ) -> tuple[Int[ndarray, " p"], Int[ndarray, " p"], Int[ndarray, " p"]]:
     """Pairs (triangle, column i, column j) whose column lies in the triangle's projected box."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    low = corners.min(axis=1)
+    high = corners.max(axis=1)
     first_i, first_j = np.searchsorted(x, low[:, 0]), np.searchsorted(y, low[:, 1])
     count_i = np.searchsorted(x, high[:, 0], "right") - first_i
     count_j = np.searchsorted(y, high[:, 1], "right") - first_j
@@ -360,7 +362,8 @@ def _covered_columns(
 
 def owned_centroids(mesh: SegmentedMesh) -> Float[ndarray, "s 3"]:
     """Centre of the volume that belongs to each segment: its mesh's without that of the segments nested in it."""
-    volumes, moments = mesh.owned_volumes, np.stack([_first_moment(segment) for segment in mesh.segments])
+    volumes = mesh.owned_volumes
+    moments = np.stack([_first_moment(segment) for segment in mesh.segments])
     for outer in range(len(moments)):  # the inner ones come first and are done
         moments[outer] -= sum((moments[inner] for inner, other in mesh.nesting if other == outer), np.zeros(3))
     return moments / volumes[:, None]
@@ -380,7 +383,8 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[ndarray, "s 4 v 3"]:
     The vertices are those of ``mesh.merged()``.
     """
     ends = np.cumsum([0, *(len(segment.vertices) for segment in mesh.segments)])
-    centers, volumes = owned_centroids(mesh), mesh.owned_volumes
+    centers = owned_centroids(mesh)
+    volumes = mesh.owned_volumes
     result = np.zeros((len(mesh.segments), 4, ends[-1], 3))
     for owner, center in enumerate(centers):
         within = [inner for inner, outer in mesh.nesting if outer == owner]

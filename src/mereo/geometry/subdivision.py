@@ -102,7 +102,8 @@ def split_at_creases(segment: Segment) -> tuple[Segment, Indices]:
     Returns the segment (itself where nothing is split), and for each of its vertices the index of the one that it was:
     first all old ones in their order, then the added ones. Faces keep their order and orientation.
     """
-    faces, count = segment.faces, len(segment.vertices)
+    faces = segment.faces
+    count = len(segment.vertices)
     same = np.arange(count)
     if not len(faces):
         return segment, same

@@ -110,9 +110,11 @@ def find_symmetries(mesh: SegmentedMesh, tolerance: float) -> tuple[Symmetry, ..
             whole = _about(middle, turns[0])
             return (Symmetry(whole, None, None, surface.landing(whole)),)
         return _settled(surface, center, turns)
-    main, around = axes[0 if alike[1] else 2], np.arange(1, round(2 * pi / STEP)) * STEP
+    main = axes[0 if alike[1] else 2]
+    around = np.arange(1, round(2 * pi / STEP)) * STEP
     half = surface.settle(_about(center, pi * main))
-    axis, middle = _axis_of(half), _fixed_point([half])
+    axis = _axis_of(half)
+    middle = _fixed_point([half])
     if np.mean([surface.is_kept(_about(middle, angle * axis)) for angle in around]) >= NEARLY:
         whole = _about(middle, axis)  # by 1 rad, which nothing but a round part inside survives
         return (Symmetry(whole, None, axis, surface.landing(whole)), *_settled(surface, middle, pi * axes[1:2]))
@@ -153,7 +155,8 @@ class _Surface:
         vertices, faces, _ = mesh.merged()
         normals = area_vectors(vertices, faces)
         area = norm(normals, axis=1)
-        rng, total = default_rng(0), np.cumsum(area)
+        rng = default_rng(0)
+        total = np.cumsum(area)
         face = np.searchsorted(total, (np.arange(SAMPLES) + rng.random(SAMPLES)) * total[-1] / SAMPLES)
         face = np.minimum(face, len(faces) - 1)
         share = rng.dirichlet((1.0, 1.0, 1.0), SAMPLES)
@@ -196,10 +199,12 @@ class _Surface:
 
     def settle(self, turn: Transform) -> Transform:
         """The turn near a given one that brings a few samples nearest to the planes they come to lie on."""
-        few, step = self._few, max(1, len(self.visible) // FEW)
+        few = self._few
+        step = max(1, len(self.visible) // FEW)
         normals = self.normals[self.visible[::step]]
         for _ in range(12):
-            moved, turned = transform_points(turn, few), normals @ turn[:3, :3].T
+            moved = transform_points(turn, few)
+            turned = normals @ turn[:3, :3].T
             offset = self.nearest(moved)[1] - moved
             center = moved.mean(axis=0)
             rows = np.hstack([np.cross(moved - center, turned), turned])
@@ -210,7 +215,8 @@ class _Surface:
 
     def landing(self, turn: Transform) -> tuple[int | None, ...]:
         """For each segment the one on whose surface most of its vertices come to lie."""
-        segments, limit = self.mesh.segments, (2 * self.tolerance) ** 2
+        segments = self.mesh.segments
+        limit = (2 * self.tolerance) ** 2
         result = list[int | None]()
         for segment in segments:
             moved = transform_points(turn, segment.vertices[:: max(1, len(segment.vertices) // FEW)])

@@ -112,7 +112,8 @@ def look_at(eye: Vector, target: Vector, up: Vector, roll_rad: float = 0.0) -> T
         x = np.cross(z, np.eye(3)[np.argmin(np.abs(z))])
     x = x / norm(x)
     y = np.cross(z, x)
-    cosine, sine = np.cos(roll_rad), np.sin(roll_rad)
+    cosine = np.cos(roll_rad)
+    sine = np.sin(roll_rad)
     return rigid(np.stack([cosine * x + sine * y, cosine * y - sine * x, z], axis=1), eye)
 
 
@@ -243,7 +244,8 @@ def align_all(
     """
     center = shapes.mean(axis=1)
     centred = shapes - center[:, None]
-    mean, rotation = centred[0], np.broadcast_to(np.eye(3), (len(shapes), 3, 3))
+    mean = centred[0]
+    rotation = np.broadcast_to(np.eye(3), (len(shapes), 3, 3))
     for _ in range(rounds):
         covariance = np.matmul(centred.transpose(0, 2, 1), mean)
         rotation = best_rotations(covariance.astype(float)).astype(shapes.dtype)

@@ -117,7 +117,8 @@ def remove_abandoned(directory: Path, name: str | None = None) -> bool:
 
     An output that a killed one had taken away is put back. Without locks nothing is known, and nothing removed.
     """
-    is_written, names = False, ".+" if name is None else re.escape(name)
+    is_written = False
+    names = ".+" if name is None else re.escape(name)
     items = list[Path]()
     with suppress(OSError):  # it may be missing, or be no one's to list
         items = list(directory.iterdir())

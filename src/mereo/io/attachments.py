@@ -153,7 +153,9 @@ def turned_attachment(attachment: Attachment, frame: CarryFrame, named: Space | 
         raise ValueError(
             f"--carry-frame is {stated}, but the object's own files name {named}: leave it out, or export them again"
         )
-    space, given, name = stated or named, attachment.space or stated, attachment.name
+    space = stated or named
+    given = attachment.space or stated
+    name = attachment.name
     if space is not None and space == given:
         return attachment
     content = attachment.content
@@ -185,7 +187,8 @@ def _fits_better(turned: Content, content: Content, inside: Points) -> bool:
         share = content.tissue_share(inside)
         return share < SHARE and turned.tissue_share(inside) > share + MORE
     assert not isinstance(turned, Volume) and not isinstance(content, Volume)
-    tree, size = cKDTree(inside), longest_side(inside)
+    tree = cKDTree(inside)
+    size = longest_side(inside)
     away, other = (float(np.median(tree.query(each.points)[0])) for each in (content, turned))
     return away > NEAR * size and away > FARTHER * other
 

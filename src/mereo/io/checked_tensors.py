@@ -76,7 +76,8 @@ def check_tensors(tensors: Tensors, shapes: Mapping[str, str], sizes: Mapping[st
             raise ValueError(f"it has no tensor {name!r}")
         if np.iscomplexobj(tensors[name]):
             raise ValueError(f"its tensor {name!r} has complex numbers")
-        shape, wanted = tensors[name].shape, axes.split()
+        shape = tensors[name].shape
+        wanted = axes.split()
         if len(shape) != len(wanted) or any(
             length != (int(axis) if axis.isdecimal() else known.setdefault(axis, length))
             for length, axis in zip(shape, wanted, strict=True)

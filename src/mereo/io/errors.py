@@ -170,7 +170,8 @@ def _too_large(path: AnyPath) -> SizeError:
 
 @contextmanager
 def _memory_limit() -> Iterator[None]:
-    more, before = max_bytes(), resource.getrlimit(resource.RLIMIT_AS)
+    more = max_bytes()
+    before = resource.getrlimit(resource.RLIMIT_AS)
     now = int(PAGES.read_text().split()[0]) * resource.getpagesize()
     bounds = [limit for limit in before if limit != resource.RLIM_INFINITY]
     resource.setrlimit(resource.RLIMIT_AS, (min([now + more, *bounds]), before[1]))

@@ -219,7 +219,8 @@ def _fields_of_numbers(numbers: list[float]) -> Fields:
 
 def _frame(fields: Fields, stem: str, index: int | None) -> Fields:
     """Fields of one frame; ``fields`` itself where it describes one camera."""
-    frames, chosen = fields.get("frames"), index
+    frames = fields.get("frames")
+    chosen = index
     if _states_a_camera(fields):
         return fields
     if isinstance(frames, list) and any(map(_states_a_camera, frames)):
@@ -275,7 +276,8 @@ def _pinhole(fields: Fields) -> tuple[float, float, float, float]:
 def _depth_scale(fields: Fields) -> float | None:
     """Pixel value of one metre, whatever the file means by its number (the module's note)."""
     if "depth_units" in fields:  # RealSense's option: metres of one unit
-        value, per_metre = float(fields["depth_units"]), 1.0
+        value = float(fields["depth_units"])
+        per_metre = 1.0
     elif "depth_scale" in fields:
         value = float(fields["depth_scale"])
         if value >= 100:

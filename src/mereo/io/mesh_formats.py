@@ -120,7 +120,8 @@ class _Known:
 def _kept_mesh(known: _Known) -> SegmentedMesh:
     path = known.path
     with stage(f"read {path}"):
-        mesh, segments = read_segmented_mesh(path), list[Segment]()
+        mesh = read_segmented_mesh(path)
+        segments = list[Segment]()
         for segment in mesh.segments:
             fewer, way = simplified(segment)
             segments.append(fewer)
@@ -235,7 +236,8 @@ def _split_parts(
     """Parts of a file, with the colour of all faces: one per object, or per group where there is only one object."""
     level = 0 if len({key[0] for key in owners}) > 1 else 1
     labels = [key[level] or key[0] for key in owners]
-    names, parts = list(dict.fromkeys(labels)), list[Part]()
+    names = list(dict.fromkeys(labels))
+    parts = list[Part]()
     for name in names:
         rows = [row for row, label in enumerate(labels) if label == name]
         worn = {colors.get(owners[row][2]) for row in rows}
@@ -255,7 +257,9 @@ def _material_colors(mesh: Path, library: str) -> dict[str, Color]:
         path = _neighbour(mesh, library)
     if path is None:
         return {}
-    colors, textured, name = dict[str, Color](), set[str](), ""
+    colors = dict[str, Color]()
+    textured = set[str]()
+    name = ""
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         kind, *cells = line.split() or [""]
         if kind == "newmtl":
@@ -281,7 +285,9 @@ def _neighbour(path: Path, name: str) -> Path:
 def _scene_parts(path: Path) -> list[Part]:
     scene = _load_scene(path)
     base = VIEWER_ROOT if VIEWER_ROOT in scene.graph.nodes else scene.graph.base_frame
-    nodes, parts, is_dae = _nodes_with_faces(scene), list[Part](), path.suffix.lower() == ".dae"
+    nodes = _nodes_with_faces(scene)
+    parts = list[Part]()
+    is_dae = path.suffix.lower() == ".dae"
     unit_m = trimesh.units.unit_conversion(scene.units, "meters") if is_dae and nodes else 1.0
     for node in nodes:
         vertices, faces, geometry = _in_frame(scene, node, base)
@@ -406,7 +412,8 @@ def _plain_gltf(path: Path) -> tuple[JsonObject, Buffers]:
     Instances and the materials of a mesh become nodes of their own, and normalized or sparse positions become floats.
     Images in other files are not opened: shapes do not need them.
     """
-    content, chunk = path.read_bytes(), b""
+    content = path.read_bytes()
+    chunk = b""
     if content[:4] == b"glTF":
         start = 28 + int.from_bytes(content[12:16], "little")
         size = int.from_bytes(content[start - 8 : start - 4], "little")
@@ -446,7 +453,8 @@ def _buffer(path: Path, uri: str | None, chunk: bytes) -> bytes:
 
 def _values(tree: JsonObject, buffers: Buffers, accessor: JsonObject) -> Float[ndarray, "n k"]:
     """Values of an accessor (glTF 2.0, sections 3.6.2 and 5.1)."""
-    kind, width = np.dtype(KINDS[accessor["componentType"]]), WIDTHS[accessor["type"]]
+    kind = np.dtype(KINDS[accessor["componentType"]])
+    width = WIDTHS[accessor["type"]]
     shape = accessor["count"], width
     values = np.zeros(shape)
     if "bufferView" in accessor:
@@ -474,12 +482,14 @@ def _stored(tree: JsonObject, buffers: Buffers, values: Points) -> JsonObject:
 def _spread(tree: JsonObject, buffers: Buffers, node: JsonObject) -> None:
     """Give a node's mesh to children, one for each instance and each of its materials, where it has several."""
     mesh = tree["meshes"][node["mesh"]]
-    stated, materials = node.get("extensions", {}).pop(INSTANCES, None), mesh["primitives"]
+    stated = node.get("extensions", {}).pop(INSTANCES, None)
+    materials = mesh["primitives"]
     if mesh.get("name"):
         node.setdefault("name", mesh["name"])
     if stated is None and len(materials) == 1:
         return
-    number, title = node.pop("mesh"), node.get("name", "part")
+    number = node.pop("mesh")
+    title = node.get("name", "part")
     places = {
         key.lower(): _values(tree, buffers, tree["accessors"][index])
         for key, index in (stated or {}).get("attributes", {}).items()
@@ -487,7 +497,8 @@ def _spread(tree: JsonObject, buffers: Buffers, node: JsonObject) -> None:
     }
     for row in range(max(map(len, places.values()), default=1)):
         place = {key: values[row].tolist() for key, values in places.items()}
-        name, first = title if stated is None else f"{title}_{row + 1}", str(len(tree["nodes"]))
+        name = title if stated is None else f"{title}_{row + 1}"
+        first = str(len(tree["nodes"]))
         for index, part in enumerate(materials):
             child = {"mesh": number, "name": name, **place}
             if len(materials) > 1:
@@ -571,7 +582,8 @@ def _glb_part(
 
 def _colors(geometry: Any, plain: Color) -> tuple[Color, UInt8[ndarray, "v 3"] | None]:
     """One colour of a mesh, and those of its vertices where they have several; as a screen shows them."""
-    visual, count = geometry.visual, len(geometry.vertices)
+    visual = geometry.visual
+    count = len(geometry.vertices)
     material = getattr(visual, "material", None)
     factor = getattr(material, "baseColorFactor", None)
     tint = np.ones(3) if factor is None else np.asarray(factor, float)[:3] / 255.0

@@ -48,7 +48,8 @@ class ObjectPath:
 
     def __post_init__(self) -> None:
         protocol, _, rest = self.url.partition("://")
-        protocol, parts = protocol.lower(), rest.rstrip("/").split("/")
+        protocol = protocol.lower()
+        parts = rest.rstrip("/").split("/")
         if "@" in parts[0]:
             raise ValueError(
                 f"{protocol}://...@... has credentials in it: set them in the environment or a profile, as AWS_PROFILE"
@@ -174,7 +175,8 @@ def claim(folder: Place, name: str, settings: JsonObject, kind: str) -> JsonObje
     Raises ``FileExistsError`` for a file, or a folder that holds something but no such file, and ``ValueError`` where
     that holds no settings.
     """
-    path, content = folder / name, json_text(settings)
+    path = folder / name
+    content = json_text(settings)
     if isinstance(folder, Path):
         check_place(folder, may_be_link=True)
         if folder.exists() and not folder.is_dir():

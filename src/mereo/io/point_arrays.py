@@ -149,7 +149,8 @@ def _positions(source: Any) -> tuple[Points, Points | None, str, bool]:
         return np.empty((0, 3)), None, name, False
     normals = None
     if values.ndim in (2, 3) and values.shape[-1] == 6:
-        normals, values = _normals(_floats(values[..., 3:]).reshape(-1, 3), name), values[..., :3]
+        normals = _normals(_floats(values[..., 3:]).reshape(-1, 3), name)
+        values = values[..., :3]
     if wrong := _what_else(values):
         raise ValueError(f"{name} {wrong}")
     return _floats(values).reshape(-1, 3), normals, name, values.ndim == 3
@@ -158,7 +159,8 @@ def _positions(source: Any) -> tuple[Points, Points | None, str, bool]:
 def _normals(columns: Points, name: str) -> Points | None:
     """Normals that three more columns of points are; None of colours. Rows that are not finite or 0 say nothing."""
     known = columns[np.isfinite(columns).all(axis=1) & columns.any(axis=1)]
-    least, most = known.min(initial=0), known.max(initial=0)
+    least = known.min(initial=0)
+    most = known.max(initial=0)
     are_normals = least < 0 and (np.abs(norm(known, axis=1) - 1) < 0.01).all()
     if (least < 0 and not are_normals) or most > 255 or (most > 1 and (known != np.rint(known)).any()):
         raise ValueError(
@@ -348,7 +350,9 @@ def _floats(values: ndarray) -> Float[ndarray, "..."]:
 def _what_else(values: ndarray) -> str:
     """What numbers are instead of points, and what to do: the end of a sentence about them; empty for points."""
     if values.ndim in (2, 3):
-        flat, rows, columns = values.ndim == 2, values.shape[0], values.shape[-1]
+        flat = values.ndim == 2
+        rows = values.shape[0]
+        columns = values.shape[-1]
         if not flat and columns in (3, 4) and values.dtype == np.uint8:
             return "is a color image, which shows no positions; a depth image or cloud is needed: give one of these"
         if columns == 3:

@@ -117,7 +117,8 @@ def stage(text: str) -> Iterator[None]:
     if not SHOWS_STAGES.get():
         yield
         return
-    started, ended = time.monotonic(), threading.Event()
+    started = time.monotonic()
+    ended = threading.Event()
 
     def show() -> None:
         wait_s = STAGE_S

@@ -263,7 +263,8 @@ def _mask_layers(image: Image.Image) -> MaskLayers:
 def _chosen_pixels(layers: MaskLayers, name: str, size: Size | None, values: WholeNumbers) -> PixelMask:
     is_lossy, opacity, shown, stored = layers
     channels = stored.reshape(*stored.shape[:2], -1)
-    ids, has_ids = channels.max(axis=-1), bool((channels == channels[..., :1]).all())
+    ids = channels.max(axis=-1)
+    has_ids = bool((channels == channels[..., :1]).all())
     mask = np.asarray(shown.reshape(*shown.shape[:2], -1).any(axis=-1))
     if size is not None and mask.shape != (size[1], size[0]):
         raise ValueError(
@@ -480,7 +481,8 @@ def _pcd_points(path: Path) -> Points:
     header, body = _pcd_parts(path.read_bytes())
     if missing := [key for key in ("FIELDS", "SIZE", "TYPE", "POINTS") if key not in header]:
         raise ValueError(f"its header has no {missing[0]}")
-    count, row = int(header["POINTS"][0]), _pcd_row(header)
+    count = int(header["POINTS"][0])
+    row = _pcd_row(header)
     width, height = (int(header.get(key, [str(count)])[0]) for key in ("WIDTH", "HEIGHT"))
     if count < 0 or ({"WIDTH", "HEIGHT"} <= header.keys() and width * height != count):
         raise ValueError(f"its header states {count} points and {width} x {height}")
@@ -558,9 +560,11 @@ def _pcd_compressed(body: bytes, row: np.dtype, count: int) -> Points:
 
 def _lzf_decompress(data: bytes, size: int) -> bytes:
     """Decompress Marc Lehmann's LZF: runs of literals, or copies of ``length`` bytes from ``offset`` back."""
-    output, at = bytearray(), 0
+    output = bytearray()
+    at = 0
     while at < len(data):
-        control, at = data[at], at + 1
+        control = data[at]
+        at = at + 1
         if control < 32:
             output += data[at : at + control + 1]
             at += control + 1

@@ -68,7 +68,9 @@ def camera_frames(
             "all but --mask and --mask-value"
         )
     rs = library("pyrealsense2", REALSENSE, source)
-    config, pipeline, name = rs.config(), rs.pipeline(), source.partition(":")[2]
+    config = rs.config()
+    pipeline = rs.pipeline()
+    name = source.partition(":")[2]
     if is_live(source):
         serials = _serials(rs)
         if not serials or name not in ("", *serials):
@@ -104,7 +106,9 @@ def _serials(rs: Any) -> list[str]:
 
 
 def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Iterator[RecordedFrame | None]:
-    topic, time_s, arrived_s = f"{REALSENSE} {Path(name).name}", 0.0, monotonic()
+    topic = f"{REALSENSE} {Path(name).name}"
+    time_s = 0.0
+    arrived_s = monotonic()
     camera: Camera | None = None
     before: tuple[Any, float] | None = None
     try:
@@ -117,14 +121,16 @@ def _frames(rs: Any, pipeline: Any, playback: Any, name: str, align: Any) -> Ite
                     raise _silence(name, name in _serials(rs))
                 yield None
                 continue
-            image, camera = np.array(depth.get_data(), np.uint16), camera or _camera(depth, topic)
+            image = np.array(depth.get_data(), np.uint16)
+            camera = camera or _camera(depth, topic)
             if image.shape != (camera.height, camera.width):
                 raise ValueError(resized(topic, image.shape[::-1], (camera.width, camera.height)))
             stamp = depth.get_frame_timestamp_domain(), depth.get_timestamp()
             if before is not None:  # the first frames may be stamped by another clock
                 is_same = stamp[0] == before[0]
                 time_s += max(0.0, stamp[1] - before[1]) / 1e3 if is_same else monotonic() - arrived_s
-            before, arrived_s = stamp, monotonic()
+            before = stamp
+            arrived_s = monotonic()
             yield RecordedFrame(topic, time_s, partial(_depth_image, image, float(depth.get_units()), camera))
     finally:
         with suppress(RuntimeError):  # of a camera that is gone

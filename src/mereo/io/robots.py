@@ -133,7 +133,8 @@ def read_robot(path: AnyPath, robot_meshes: RobotMeshes = "visual") -> Robot:
             joint.axis = np.reshape(joint.axis, 3)
         every = [(link.name, each) for link in described.links for each in (link.visuals or link.collisions)]
         solids = [_solid(each.geometry) for _, each in every]
-    shapes, states = list[_Shape](), [(str(path), path.stat())]
+    shapes = list[_Shape]()
+    states = [(str(path), path.stat())]
     for (link, each), solid in zip(every, solids, strict=True):
         if solid is None:
             mesh = each.geometry.mesh
@@ -181,7 +182,8 @@ def _read_sdf(yourdfpy: Any, root: Any) -> tuple[Any, NamedPoses]:
     (model,) = models
     elements = {each.get("name"): each for kind in ("frame", "joint", "link") for each in model.iterfind(kind)}
     names = {"link": "", "joint": "child", "frame": "attached_to"}
-    poses, pending = {"": np.eye(4), "__model__": np.eye(4)}, set[str]()
+    poses = {"": np.eye(4), "__model__": np.eye(4)}
+    pending = set[str]()
 
     def pose_of(name: str) -> Transform:
         """Pose of a link, joint or frame in the model."""
@@ -202,7 +204,8 @@ def _read_sdf(yourdfpy: Any, root: Any) -> tuple[Any, NamedPoses]:
         turn = Rotation.from_euler("xyz", angles, degrees=place.get("degrees") == "true").as_matrix()
         return pose_of(place.get("relative_to", base.strip())) @ rigid(turn, np.array([x, y, z]))
 
-    joints, frames = list[Any](), {link.get("name"): pose_of(link.get("name")) for link in model.iterfind("link")}
+    joints = list[Any]()
+    frames = {link.get("name"): pose_of(link.get("name")) for link in model.iterfind("link")}
     for element in model.iterfind("joint"):
         name, parent, child = element.get("name"), *(element.findtext(key, "").strip() for key in ("parent", "child"))
         if parent != "world":  # the camera may see it from anywhere
@@ -279,10 +282,13 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
     data.qpos[model.jnt_qposadr[np.isin(model.jnt_type, list(kinds))]] = 0.0
     mujoco.mj_kinematics(model, data)
     names = [model.body(number).name or f"body {number}" for number in range(model.nbody)]
-    links, joints, place = {name: yourdfpy.Link(name) for name in names}, list[Any](), {names[0]: np.zeros(3)}
+    links = {name: yourdfpy.Link(name) for name in names}
+    joints = list[Any]()
+    place = {names[0]: np.zeros(3)}
     is_alone = int((model.body_parentid[1:] == 0).sum()) == 1
     for body in range(1, model.nbody):
-        carrier, chain = names[model.body_parentid[body]], list[Any]()
+        carrier = names[model.body_parentid[body]]
+        chain = list[Any]()
         for number in range(model.body_jntadr[body], model.body_jntadr[body] + model.body_jntnum[body]):
             joint = model.joint(number)
             name = joint.name or f"joint {number}"
@@ -304,7 +310,8 @@ def _read_mjcf(path: Path, yourdfpy: Any, mujoco: Any, robot_meshes: RobotMeshes
             joint.parent, joint.child, joint.origin = carrier, frame, rigid(np.eye(3), at - place[carrier])
             place[frame], carrier = at, frame
             joints.append(joint)
-    shapes, link_frames = list[_Shape](), NamedPoses()
+    shapes = list[_Shape]()
+    link_frames = NamedPoses()
     for body in range(1, model.nbody):
         at = data.xpos[body] - place[names[body]]
         link_frames[names[body]] = rigid(data.xmat[body].reshape(3, 3), at)
@@ -365,7 +372,8 @@ def _numbers(text: str | None, count: int) -> list[float]:
 def _mesh_file(path: Path, link: str, name: str) -> Path:
     """File of a mesh that a link names: relative to the robot's file, or in a package in the folders above it."""
     scheme, _, rest = name.rpartition("://")
-    folder, tries = path.resolve().parent, [path.resolve().parent / rest]
+    folder = path.resolve().parent
+    tries = [path.resolve().parent / rest]
     if scheme in ("package", "model"):
         package, _, inside = rest.partition("/")
         above = (folder, *folder.parents)
@@ -419,14 +427,16 @@ class _Described:
 
 @lru_cache(maxsize=16)
 def _assembled(content: _Described) -> Robot:
-    path, joints = content.path, _from_base(content.path, content.robot)
+    path = content.path
+    joints = _from_base(content.path, content.robot)
     limits = _limits(path, joints)
     poses = {link.name: np.eye(4) for link in content.robot.links}
     carriers = dict.fromkeys(poses, ())
     for joint in joints:
         poses[joint.child] = poses[joint.parent] @ _origin(joint)
         carriers[joint.child] = carriers[joint.parent] + ((joint.name,) if joint.name in limits else ())
-    names, parts = dict[Names, str](), dict[str, list[Segment]]()
+    names = dict[Names, str]()
+    parts = dict[str, list[Segment]]()
     order = [*(link for link in poses if not carriers[link]), *(joint.child for joint in joints)]
     for shape in sorted(content.shapes, key=lambda shape: order.index(shape.link)):
         pieces = parts.setdefault(names.setdefault(carriers[shape.link], shape.link), [])
@@ -469,7 +479,8 @@ def _origin(element: Any) -> Transform:
 
 def _from_base(path: Path, robot: Any) -> list[Any]:
     """Joints, each after those that carry it; raises ``ValueError`` where links and joints form no tree."""
-    links, above = [link.name for link in robot.links], Texts()
+    links = [link.name for link in robot.links]
+    above = Texts()
     for joint in robot.joints:
         if joint.parent not in links or joint.child not in links:
             raise ValueError(f"{path}: joint {joint.name!r} names a link that is not in the file: correct it")
@@ -479,7 +490,8 @@ def _from_base(path: Path, robot: Any) -> list[Any]:
                 "robot is a tree without loops: leave one of them out"
             )
         above[joint.child] = joint.name
-    reached, joints = {link for link in links if link not in above}, list[Any]()
+    reached = {link for link in links if link not in above}
+    joints = list[Any]()
     if len(reached) != 1 or len(set(links)) < len(links):
         raise ValueError(
             f"{path} has {len(reached)} links that no joint carries ({', '.join(sorted(reached))}); it must be one, "
@@ -495,14 +507,18 @@ def _from_base(path: Path, robot: Any) -> list[Any]:
 
 def _limits(path: Path, joints: Sequence[Any]) -> dict[str, tuple[str, float, float]]:
     """Of each joint that moves: the joint that it follows or "", and its range, as ``RobotJoint`` has them."""
-    by_name, ranges = {joint.name: joint for joint in joints}, dict[str, tuple[str, float, float]]()
+    by_name = {joint.name: joint for joint in joints}
+    ranges = dict[str, tuple[str, float, float]]()
     for joint in joints:
         if joint.type not in KINDS:
             raise ValueError(
                 f"{path}: joint {joint.name!r} is of the kind {joint.type!r}; it must be {', '.join(KINDS)}: make it "
                 "fixed, or several joints with links between them"
             )
-        factor, offset, leader, passed = 1.0, 0.0, joint, [joint.name]
+        factor = 1.0
+        offset = 0.0
+        leader = joint
+        passed = [joint.name]
         while leader.mimic is not None:
             name = leader.mimic.joint
             if name not in by_name or by_name[name].type == "fixed" or name in passed or leader.mimic.multiplier == 0:

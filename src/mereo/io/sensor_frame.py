@@ -191,7 +191,8 @@ def _near_origin(frame: SensorFrame) -> SensorFrame:
 
     A scan is moved by whole units, where the origin means nothing. Raises ``ValueError`` where it is to be the camera.
     """
-    points, size = frame.cloud.points, longest_side(frame.cloud.points)
+    points = frame.cloud.points
+    size = longest_side(frame.cloud.points)
     middle = np.median(points, axis=0)
     times = float(norm(middle)) / size if size > 0 else 0.0
     if frame.depth is not None or times <= FAR:
@@ -217,7 +218,9 @@ def _stated_pose(frame: SensorFrame, reading: InputConfig) -> Transform | None:
 
     Some programs store points as the sensor measured them next to its pose, others points in the frame of the pose.
     """
-    path, points, pose = frame.path, frame.cloud.points, read_viewpoint(frame.path)
+    path = frame.path
+    points = frame.cloud.points
+    pose = read_viewpoint(frame.path)
     if pose is None or reading.viewpoint == "ignored" or frame.axes == "scanner":
         return None
     if reading.viewpoint == "pose":

@@ -123,7 +123,8 @@ def read_tetrahedra(path: Path) -> tuple[Points, Elements, Indices]:
         nodes, elements = _volume(path, arrays)
     elif suffix in (*VTK_SUFFIXES, *MESHIO_SUFFIXES):
         frames = _mesh_frames(path)
-        nodes, elements = frames.points[0], frames.tetrahedra
+        nodes = frames.points[0]
+        elements = frames.tetrahedra
     else:
         known = ", ".join((".npz", *VTK_SUFFIXES[:2], *MESHIO_SUFFIXES))
         raise ValueError(f"{path} has the suffix {path.suffix!r}; a volume mesh is one of {known}: convert it")
@@ -167,12 +168,14 @@ def _sequence(path: Path, names: Names, mesh: Path | None) -> TetrahedralRecord 
     frames = _mesh_frames(path)
     if 0 in frames.points.shape:
         raise ValueError(f"{path} has no frames, or none with nodes; at least one state is needed: export some")
-    tetrahedra, rest = frames.tetrahedra, None
+    tetrahedra = frames.tetrahedra
+    rest = None
     if mesh is None:
         mesh = _rest_file(path)
     if mesh is not None:
         at_rest = _mesh_frames(mesh)
-        rest, tetrahedra = at_rest.points[0], at_rest.tetrahedra
+        rest = at_rest.points[0]
+        tetrahedra = at_rest.tetrahedra
         if len(rest) != frames.points.shape[1]:
             raise ValueError(
                 f"{path} has {frames.points.shape[1]} nodes a frame but {mesh} {len(rest)}; both need the same nodes, "
@@ -239,7 +242,8 @@ def _mesh_frames(path: Path) -> MeshFrames:
     elif kinds[0] in FRAME_SUFFIXES:
         meshes = {f"frame {file.name}": _floats(file, "the mesh", mesh_vertices(file), 2) for file in files}
         _check_topology(path, meshes)
-        points, names = np.stack(list(meshes.values())), tuple(meshes)
+        points = np.stack(list(meshes.values()))
+        names = tuple(meshes)
     else:
         raise ValueError(
             f"{path} has the suffix {kinds[0]!r}; states are an NPZ or NPY file, a PVD or XDMF file, or meshes "

@@ -211,7 +211,9 @@ def is_labels(volume: Volume) -> bool:
     slices = volume.values[:, :, min(step // 2, depth - 1) :: step]
     if len(np.unique(slices)) <= FEW:
         return True
-    least, equal, counted = volume.values.min(), 0, 0
+    least = volume.values.min()
+    equal = 0
+    counted = 0
     for first, second in ((slices[1:], slices[:-1]), (slices[:, 1:], slices[:, :-1])):
         seen = (first != least) | (second != least)
         equal, counted = equal + int((seen & (first == second)).sum()), counted + int(seen.sum())
@@ -263,7 +265,8 @@ def read_label_volume(*paths: Path) -> LabelVolume:
 
 def _labels(path: Path, volume: Volume) -> LabelVolume:
     with readable(path, "label volume"):
-        values, segments = volume.values, _slicer_segments(volume)
+        values = volume.values
+        segments = _slicer_segments(volume)
     if values.ndim != 3 and not (values.ndim == 4 and segments):
         raise ValueError(
             f"{path} has {values.ndim} dimensions; a label volume has 3, or the layers of a segmentation of 3D Slicer: "
@@ -329,7 +332,9 @@ def _renumbered(
 
 def _joined_labels(paths: Sequence[Path]) -> LabelVolume:
     """Label volume of files with a segment each."""
-    layers, names, empty = list[ndarray](), dict[int, str](), list[str]()
+    layers = list[ndarray]()
+    names = dict[int, str]()
+    empty = list[str]()
     for number, path in enumerate(paths, start=1):
         volume = read_label_volume(path)
         if len(volume.values) > 1:
@@ -418,14 +423,17 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
             f"the volume has no voxel of {names[missing[0]]!r}, value {missing[0]}; it holds the values "
             f"{', '.join(map(str, volume.values))}: correct `names`"
         )
-    layers, segments = volume.labels, list(dict.fromkeys(names.values()))
+    layers = volume.labels
+    segments = list(dict.fromkeys(names.values()))
     check_size("the label volume", (len(segments) + 3) * layers[0].size)  # a byte for each voxel of a mask
     labels = [[value for value in names if names[value] == name] for name in segments]
     masks = [np.logical_or.reduce([(layers == value).any(axis=0) for value in group]) for group in labels]
     parents = _part_masks(masks)
     grid = _Grid.around(np.logical_or.reduce(masks), volume.T_world_index, cells)
     margins = _margins(_in_partition([grid.share(mask) for mask in masks], parents), parents)
-    thin, parts, cell = Texts(), list[Segment](), abs(float(det(volume.T_world_index[:3, :3])))
+    thin = Texts()
+    parts = list[Segment]()
+    cell = abs(float(det(volume.T_world_index[:3, :3])))
     for index, (name, margin) in enumerate(zip(segments, margins, strict=True)):
         part = grid.surface(margin, name, volume.colors.get(labels[index][0], palette_color(index)))
         kept = 0.0 if part is None else part.volume / (float(masks[index].sum()) * cell)
@@ -449,7 +457,8 @@ def segment_surfaces(volume: LabelVolume, names: Mapping[int, str], cells: int) 
 def _part_masks(masks: list[VoxelMask]) -> dict[int, int]:
     """Make masks nested or apart, in place; returns those that are nested, from the smallest on, and what is around."""
     sizes = [int(mask.sum()) for mask in masks]
-    order, parents = sorted(range(len(masks)), key=lambda index: sizes[index]), dict[int, int]()
+    order = sorted(range(len(masks)), key=lambda index: sizes[index])
+    parents = dict[int, int]()
     for place, small in enumerate(order):
         for large in order[place + 1 :]:
             shared = int((masks[small] & masks[large]).sum())
@@ -534,7 +543,8 @@ class _Grid:
         if self.enclosed(smooth) >= WHOLE * whole:
             return smooth, 0.5
         smooth = gaussian_filter(means, SMOOTHING, mode="constant")
-        low, high = LEAST_LEVEL, 0.5
+        low = LEAST_LEVEL
+        high = 0.5
         for _ in range(HALVINGS):
             middle = (low + high) / 2
             low, high = (low, middle) if self.enclosed(_bent(smooth, middle)) < whole else (middle, high)

@@ -110,8 +110,10 @@ def main(place: str) -> None:
     """
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
-    folder, files = Path(place), json.load(sys.stdin)
-    log, read = vtkStringOutputWindow(), list[str]()
+    folder = Path(place)
+    files = json.load(sys.stdin)
+    log = vtkStringOutputWindow()
+    read = list[str]()
     vtkOutputWindow.SetInstance(log)
     try:
         answer = _answer(files, log, read)
@@ -126,7 +128,9 @@ def main(place: str) -> None:
 
 def _answer(files: Sequence[str], log: Any, read: list[str]) -> JsonObject:
     """Arrays of all frames; ``read`` grows by each file that is done."""
-    names, points, moved = list[str](), list[ndarray](), list[ndarray]()
+    names = list[str]()
+    points = list[ndarray]()
+    moved = list[ndarray]()
     tetrahedra = np.empty((0, 4), np.int64)
     for file in files:
         for step, data in enumerate(_steps(file)):

@@ -48,7 +48,8 @@ class Document:
             raise ValueError(f"{path} is nested too deeply; a {kind} has lists in blocks: write it again") from None
         except (yaml.YAMLError, ValueError, KeyError) as error:  # the last two of dates, numbers and truth values
             mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
-            place, why = f"{path}:{mark.line + 1}" if mark else path, getattr(error, "problem", None) or reason(error)
+            place = f"{path}:{mark.line + 1}" if mark else path
+            why = getattr(error, "problem", None) or reason(error)
             raise ValueError(f"{place}: this is not YAML in UTF-8 ({why}): correct it, or put it in quotes") from None
         if count > MOST_VALUES:
             raise ValueError(f"{path} holds {count} values; at most {MOST_VALUES} can be read: use fewer aliases")
@@ -114,7 +115,10 @@ class Document:
         raise self.error(problems[0]["loc"], self._sentence(problems[0], model) + more)
 
     def _sentence(self, problem: ErrorDetails, model: type[BaseModel]) -> str:
-        place, kind, value, context = problem["loc"], problem["type"], problem["input"], problem.get("ctx", {})
+        place = problem["loc"]
+        kind = problem["type"]
+        value = problem["input"]
+        context = problem.get("ctx", {})
         key = str(place[-1]) if place else "the file"
         rule = re.sub("^(Input|String|List) should", "it must", problem["msg"].removeprefix("Value error, "))
         rule = rule.replace("should", "must")
@@ -139,7 +143,8 @@ class Document:
 
     def _known_keys(self, place: Place, model: type[BaseModel]) -> list[str]:
         """Keys that are allowed where an unknown one is, and not yet there."""
-        fields, used = _fields_at(place[:-1], model), self.pair(place[:-1])[1]
+        fields = _fields_at(place[:-1], model)
+        used = self.pair(place[:-1])[1]
         have = {k.value for k, _ in used.value} if isinstance(used, yaml.MappingNode) else set()
         return [name for name in fields if name not in have] or fields
 

@@ -31,7 +31,8 @@ class Tracker(tracking.Tracker):
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> Any:
         whole = frame.seen.frame.whole
         if track is not None and whole is not None and is_whole(frame.seen, self.registrar):
-            model, posed = track.problem.model, track.expected(frame.time_s, self.config)
+            model = track.problem.model
+            posed = track.expected(frame.time_s, self.config)
             mesh = model.mesh(track.unit * posed.place(model.material(posed.z)))
             mask = pixels_near(whole, mesh, NEAR * model.half * track.unit)
             frame = replace(frame, seen=part_of(frame.seen, mask))

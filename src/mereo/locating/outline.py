@@ -55,7 +55,8 @@ class Jumps(NamedTuple):
     @classmethod
     def of(cls, image: DepthImage, length: float) -> "Jumps":
         """Jumps of an image, by more than a slope or noise explains; an object of this ``length`` stands on planes."""
-        depth, focal = image.depth, min(image.camera.focal_x_px, image.camera.focal_y_px)
+        depth = image.depth
+        focal = min(image.camera.focal_x_px, image.camera.focal_y_px)
         noise = noise_of_differences(second_differences(depth, 1), second_differences(depth.T, 1))
         step = np.maximum(steepest(image) * depth, NOISE_STD * noise * depth**2)
         rows = _along_rows(depth, step)
@@ -78,7 +79,8 @@ def _along_rows(
     depth: Float[np.ndarray, "h w"], step: Float[np.ndarray, "h w"]
 ) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """``Jumps.nearer`` and ``Jumps.known`` by the rows alone."""
-    width, measured = depth.shape[1], np.flatnonzero(depth)
+    width = depth.shape[1]
+    measured = np.flatnonzero(depth)
     first, last = measured[:-1], measured[1:]
     together = (first // width == last // width) & (last - first <= GAP)
     first, last = first[together], last[together]
@@ -133,7 +135,9 @@ def compare_outline(jumps: Jumps, depth: Float[np.ndarray, "h w"]) -> Outline:
         edge[first] |= folds & (near < far)
         edge[second] |= folds & (far < near)
     v, u = np.nonzero(edge)
-    hit, covered, off = np.zeros(len(v), dtype=bool), np.zeros(len(v), dtype=bool), (EDGE_OFF + 1) * step[v, u]
+    hit = np.zeros(len(v), dtype=bool)
+    covered = np.zeros(len(v), dtype=bool)
+    off = (EDGE_OFF + 1) * step[v, u]
     for down in range(-EDGE_OFF - 1, EDGE_OFF + 2):
         for right in range(-EDGE_OFF - 1, EDGE_OFF + 2):
             at = np.clip(v + down, 0, height - 1), np.clip(u + right, 0, width - 1)

@@ -56,9 +56,11 @@ def steepest(image: DepthImage) -> float:
 
 def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
     """Pixels that are measured, and on no plane that reaches farther than an object of this ``length``."""
-    off, camera = image.valid.copy(), image.camera
+    off = image.valid.copy()
+    camera = image.camera
     points = camera.directions()[off] * image.depth[off][:, None]
-    left, rng = np.ones(len(points), dtype=bool), np.random.default_rng(0)
+    left = np.ones(len(points), dtype=bool)
+    rng = np.random.default_rng(0)
     pixel = points[:, 2] / min(camera.focal_x_px, camera.focal_y_px)
     for _ in range(PLANES):
         plane = largest_plane(points[left], pixel[left], rng)
@@ -103,7 +105,8 @@ def regions(image: DepthImage, length: float, area: float) -> list[Bool[np.ndarr
         label = connected_pixels(np.where(whole, image.depth, 0.0), gaps[0] * steepest(image))
         sizes = np.bincount(label[whole])
         for number in np.flatnonzero(sizes >= MIN_POINTS):
-            mask, longest = whole & (label == number), 0.0
+            mask = whole & (label == number)
+            longest = 0.0
             if sizes[number] < SAME * size:
                 longest = main_length(points[mask])
                 if SIZES[0] * length <= longest <= SIZES[1] * length:

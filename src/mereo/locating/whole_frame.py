@@ -170,7 +170,8 @@ class WholeFrame:
     def problem(self, seen: Observation) -> Problem:
         """What a fit to the object in the frame works on; raises ``NoFit`` where that is too little."""
         frame = encode_frame(Reading.of_all(seen.cloud), None, seen.frame.axes)
-        cloud, registrar = cloud_to_fit(frame, seen.lines, self.unit), self.registrar
+        cloud = cloud_to_fit(frame, seen.lines, self.unit)
+        registrar = self.registrar
         return Problem(registrar.states, cloud.evidence(self.unit), cloud.scale_std, registrar.config)
 
     def place(self, mask: Bool[np.ndarray, "h w"], states: Sequence[Posed]) -> Place:
@@ -194,7 +195,8 @@ class WholeFrame:
         """Places where the object may be, at least one: such as may be evident at once, then others, ranked."""
         model = self.registrar.model
         area = self.unit**2 * ConvexHull(model.rest_points).area / 4  # of its shadow, over all directions
-        image, first = self.jumps.image, self.every // 2
+        image = self.jumps.image
+        first = self.every // 2
         kept = self.seen.kept_pixels()[first :: self.every, first :: self.every]
         part = DepthImage(np.where(kept, image.depth, 0.0), image.camera)
         masks = islice(filter(self.is_at_point, regions(part, 2 * model.half * self.unit, area)), LOOKS)
@@ -243,7 +245,8 @@ class WholeFrame:
         try:
             seen = self.chosen(place)
             encoded = encode_frame(seen.readings(keep_all)[0], registrar.starting_network, seen.frame.axes)
-            states, matches = () if rounds else place.states, registrar.correspondences(encoded.code)
+            states = () if rounds else place.states
+            matches = registrar.correspondences(encoded.code)
             candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds, matches)
         except NoFit:
             return None
@@ -283,7 +286,8 @@ def is_whole(seen: Observation, registrar: Registrar) -> bool:
 
     So may be a part of the image in a box, or a range of depths. A mask is of the object alone.
     """
-    frame, unit = seen.frame, scene_unit_of(seen, registrar, None)
+    frame = seen.frame
+    unit = scene_unit_of(seen, registrar, None)
     if unit is None or seen.initial_pose is not None or frame.whole is None or frame.depth is None:
         return False
     is_part = len(frame.cloud) == int(frame.whole.valid.sum()) and all(step.name in CROPS for step in seen.steps)
@@ -444,7 +448,8 @@ def instances_in(
 
     Raises ``NoFit`` where there are none.
     """
-    instances, taken = list[PlacedAnswer](), np.zeros_like(frame.jumps.image.valid)
+    instances = list[PlacedAnswer]()
+    taken = np.zeros_like(frame.jumps.image.valid)
     for placed in sorted(answers, key=lambda placed: -placed.score):
         is_further = len(instances) < most and placed.is_believed and not frame.is_among(taken, placed.mesh)
         if is_further or not instances:

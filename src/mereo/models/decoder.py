@@ -162,7 +162,8 @@ def line_of_sight(queries: QueryBatch, cloud: CloudBatch, viewpoint: VectorBatch
     silhouette. Both the plain values and eight times them, clipped to [-1, 1], so that near is resolved finely.
     """
     rays, seen = queries - viewpoint[:, None], cloud - viewpoint[:, None]
-    query_depth, seen_depth = rays[..., 2:].clamp(min=1e-3), seen[..., 2:].clamp(min=1e-3)
+    query_depth = rays[..., 2:].clamp(min=1e-3)
+    seen_depth = seen[..., 2:].clamp(min=1e-3)
     query_image, seen_image = rays[..., :2] / query_depth, seen[..., :2] / seen_depth
     index = nearest(query_image, seen_image, count)
     lateral = (gather(seen_image, index) - query_image[:, :, None]) * query_depth[:, :, None]
@@ -182,7 +183,8 @@ class ConditionedMLP(nn.Module):
         self.config, self.lookup = config, lookup
         layers, added = config.decoder, config.additions
         self.encode = FrequencyEncoding(layers.lowest_exponent, layers.highest_exponent)
-        query, width = self.encode.channels if layers.encode_positions else 3, layers.width
+        query = self.encode.channels if layers.encode_positions else 3
+        width = layers.width
         self.latent1 = nn.Linear(config.latent, width, bias=False)
         self.latent2 = nn.Linear(config.latent, width, bias=False)
         self.query1 = nn.Linear(query, width, bias=False)
@@ -240,9 +242,11 @@ class ConditionedMLP(nn.Module):
             hidden = self._activate(0, joint_linear(self.summands(0)[1:], rows, code.latent1))
         rest = None
         for number in range(1, len(self.norms)):
-            rows, latent = [hidden], None
+            rows = [hidden]
+            latent = None
             if number == layers.skip_after:
-                rows, latent = [hidden, encoded], code.latent2
+                rows = [hidden, encoded]
+                latent = code.latent2
                 if self.lookup is not None:
                     rest, seen = self.lookup(hidden, placed)
                     rows.append(seen)

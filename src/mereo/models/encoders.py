@@ -199,7 +199,8 @@ class PointTransformer(nn.Module):
         features = self.blocks[0](cloud, self.enter(cloud), _smallest(distances, max(1, self.neighbors // 2)))
         levels = list[Level]()
         for down, block in zip(self.down, self.blocks[1:], strict=True):
-            before, count = count, torch.sym_max(1, count // STRIDE)
+            before = count
+            count = torch.sym_max(1, count // STRIDE)
             features = down(features, _smallest(distances[:, :count, :before], self.neighbors))
             features = block(cloud[:, :count], features, _smallest(distances[:, :count, :count], self.neighbors))
             levels.append(Level(cloud[:, :count], features))

@@ -192,7 +192,8 @@ class Model:
 
         A head that no term of the loss has trained says nothing: it is NaN.
         """
-        distance, direction = prediction.distance, nn.functional.normalize(prediction.direction, dim=-1)
+        distance = prediction.distance
+        direction = nn.functional.normalize(prediction.direction, dim=-1)
         if not self.supervision.distances:
             distance = torch.full_like(distance, torch.nan)
         if not self.supervision.directions:

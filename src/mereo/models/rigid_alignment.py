@@ -37,7 +37,8 @@ class Alignment:
 @torch.no_grad()
 def fit_rigid(source: CloudBatch, target: CloudBatch) -> Alignment:
     """Rotation and shift with the least squared distance of moved ``source`` to ``target`` (Kabsch, 1976)."""
-    middle, aim = source.mean(dim=1, keepdim=True), target.mean(dim=1, keepdim=True)
+    middle = source.mean(dim=1, keepdim=True)
+    aim = target.mean(dim=1, keepdim=True)
     with exact(source):
         u, _, v = torch.linalg.svd((target - aim).transpose(1, 2) @ (source - middle))
         flip = torch.ones_like(source[:, 0])

@@ -43,7 +43,8 @@ def has_network() -> bool:
 
 def find_weights(name: AnyPath) -> Path:
     """Path of weights that are given by a shipped name, as an existing file, or as the folder that holds them."""
-    path, shipped = Path(name), shipped_weights()
+    path = Path(name)
+    shipped = shipped_weights()
     if str(name) in shipped and not path.is_file():
         return shipped[str(name)]
     if (path / WEIGHTS).is_file():

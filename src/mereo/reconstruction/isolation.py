@@ -114,8 +114,11 @@ def select_object(
 
     Raises ``ValueError`` where fewer than ``MIN_POINTS`` points are left, naming the step and its cure.
     """
-    points, rows, done = cloud.points, np.arange(len(cloud)), list[IsolationStep]()
-    thinned, compared = np.zeros(len(cloud), bool), np.ones(len(cloud), bool)
+    points = cloud.points
+    rows = np.arange(len(cloud))
+    done = list[IsolationStep]()
+    thinned = np.zeros(len(cloud), bool)
+    compared = np.ones(len(cloud), bool)
     for name, step in _steps(config, unit_m, frame):
         keep, detail = step(points)
         left = int(keep.sum())
@@ -217,7 +220,8 @@ def _largest_cluster(points: Points, gap: float) -> Keep:
     Clusters of fewer than ``MIN_POINTS`` are floating points and do not count.
     """
     label = clusters(points)
-    keep, sizes = label == 0, np.bincount(label)
+    keep = label == 0
+    sizes = np.bincount(label)
     parts = sizes[label] >= MIN_POINTS
     while gap > 0 and (rest := parts & ~keep).any():
         distance = cKDTree(points[keep]).query(points[rest], distance_upper_bound=gap)[0]

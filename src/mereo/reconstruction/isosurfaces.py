@@ -102,10 +102,12 @@ def sample_coarse_to_fine(field: Field, origin: Vector, spacing: Vector, shape: 
     cells = [-(-(nodes - 1) // COARSE) for nodes in shape]
     lattice = (cells[0] + 1, cells[1] + 1, cells[2] + 1)
     labels, rows = evaluate(COARSE * _all_nodes(lattice))
-    labels, rows = labels.reshape(lattice), rows.reshape(lattice)
+    labels = labels.reshape(lattice)
+    rows = rows.reshape(lattice)
     step = COARSE
     while step > 1:
-        changing, sloping = changing_cells(labels), _sloping_cells(rows, evaluate.logits())
+        changing = changing_cells(labels)
+        sloping = _sloping_cells(rows, evaluate.logits())
         if step == COARSE:
             active = _over_neighbors(changing | sloping, np.logical_or)
         else:  # next to a surface that is known the lead is small because of it, and `_halve` watches there
@@ -160,7 +162,8 @@ def _halve(
     while len(wanted):
         place = tuple(wanted.T)
         fine_labels[place], fine_rows[place] = evaluate(step * wanted)
-        low, high = np.maximum(wanted.min(axis=0) - 1, 0), wanted.max(axis=0) + 2
+        low = np.maximum(wanted.min(axis=0) - 1, 0)
+        high = wanted.max(axis=0) + 2
         part = part_of_grid(low, high)
         wanted = low + np.argwhere(_contradicted(fine_labels[part], fine_rows[part] < 0, wanted - low))
     return fine_labels, fine_rows
@@ -172,7 +175,8 @@ def _contradicted(labels: GridLabels, skipped: VoxelMask, news: Int[ndarray, "m 
     The largest and smallest label among those it touches tell: two passes of bytes instead of 26 lists of indices.
     """
     place = tuple(news.T)
-    largest, smallest = np.zeros_like(labels), np.full_like(labels, 255)
+    largest = np.zeros_like(labels)
+    smallest = np.full_like(labels, 255)
     largest[place] = smallest[place] = labels[place]
     largest, smallest = _over_neighbors(largest, np.maximum), _over_neighbors(smallest, np.minimum)
     return skipped & ((largest > labels) | (smallest < labels))

@@ -195,7 +195,8 @@ class Observation:
 
         What is in metres is None where the unit is not known.
         """
-        known, frame = self.frame.unit_m is not None, self.frame
+        known = self.frame.unit_m is not None
+        frame = self.frame
         along_z = known and frame.axes == "camera" and frame.T_result_seen is None
         return {
             "source": self.frame.source,
@@ -222,7 +223,8 @@ class Observation:
 
     def _line(self, start: str, cloud: PointCloud) -> str:
         near, middle, far = depths(cloud, self.frame.metres)
-        unit, points = self.frame.length_name, f"{start} {len(cloud)} points"
+        unit = self.frame.length_name
+        points = f"{start} {len(cloud)} points"
         if self.frame.axes == "scanner":
             return points
         return f"{points}, depth {near:.3g} to {far:.3g} {unit} (middle {middle:.3g} {unit})"
@@ -320,7 +322,8 @@ def clusters_warning(observation: Observation) -> str | None:
     first, second = points[label == 0], points[label == 1]
     if len(second) < max(MIN_POINTS, LIKE_SIZE * len(first)):
         return None
-    gap, size = cKDTree(first).query(second)[0].min(), norm(np.ptp(second, axis=0))
+    gap = cKDTree(first).query(second)[0].min()
+    size = norm(np.ptp(second, axis=0))
     if gap < APART * size:
         return None
     metres, name = observation.frame.metres, observation.frame.length_name
@@ -393,7 +396,8 @@ def is_surface(frame: SensorFrame, cloud: PointCloud) -> bool:
     """Whether a cloud has consistent normals, and no camera at the frame's origin can have seen all of it."""
     if frame.depth is not None or cloud.normals is None or len(cloud) < MIN_POINTS:
         return False
-    T, some = into_camera(cloud.points, frame.axes), random_subset(np.arange(len(cloud)), MAX_POINTS)
+    T = into_camera(cloud.points, frame.axes)
+    some = random_subset(np.arange(len(cloud)), MAX_POINTS)
     seen = PointCloud(cloud.points[some], cloud.normals[some]).transformed(T)
     points, normals = seen.points, seen.normals
     assert normals is not None
@@ -475,7 +479,8 @@ def lines_of_image(whole: DepthImage, shown: PixelMask) -> SightLines:
         whole: the depth image with all that was measured.
         shown: pixels that show the object.
     """
-    rows, columns = np.flatnonzero(shown.any(axis=1)).tolist(), np.flatnonzero(shown.any(axis=0)).tolist()
+    rows = np.flatnonzero(shown.any(axis=1)).tolist()
+    columns = np.flatnonzero(shown.any(axis=0)).tolist()
     height, width = rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1
     reach = max(height, width)
     # the window may reach beyond the picture
@@ -514,7 +519,8 @@ def shared_noise(whole: DepthImage, shown: PixelMask) -> SharedNoise:
         return np.stack([pixels % width, pixels // width, np.full(len(pixels), width)], axis=1) / width
 
     some = others[:: 1 + len(others) // ENOUGH]
-    places, inverse = terms(some), 1.0 / depth.ravel()[some]
+    places = terms(some)
+    inverse = 1.0 / depth.ravel()[some]
     points = whole.camera.unproject(width * places[:, :2] + 0.5, 1.0 / inverse)
     focal_px = min(whole.camera.focal_x_px, whole.camera.focal_y_px)
     pixel = points[:, 2] / focal_px
@@ -540,7 +546,8 @@ def shared_noise(whole: DepthImage, shown: PixelMask) -> SharedNoise:
     flat[rows] = depth.ravel()[rows]
     left = flat.reshape(height, width)
     alone = noise_of_differences(second_differences(left, 1), second_differences(left.T, 1))
-    places, inverse = terms(rows), 1.0 / flat[rows]
+    places = terms(rows)
+    inverse = 1.0 / flat[rows]
     off = inverse - places @ lstsq(places, inverse)[0]
     shared = float(np.sqrt(max(np.mean(off**2) - alone**2, 0.0)))
     side = shared_side(field.reshape(height, width)) / focal_px
@@ -552,7 +559,8 @@ def shared_side(noise: PixelValues) -> float:
 
     That is the integral of the correlation, by its course along rows and columns, as far as it is not noise.
     """
-    known, padded = np.isfinite(noise), [2 * side for side in noise.shape]
+    known = np.isfinite(noise)
+    padded = [2 * side for side in noise.shape]
     products, pairs = (
         np.fft.irfft2(np.abs(np.fft.rfft2(image, padded)) ** 2, padded)
         for image in (np.where(known, noise, 0.0), known.astype(float))
@@ -571,7 +579,8 @@ def _evenly(u: Indices, v: Indices, distance: Values, limit: int) -> Flags:
     more than ``limit`` pixels are so near.
     """
     octaves = np.log2(np.maximum(distance / DENSE, 1.0))
-    low, high = 0.0, float(octaves.max(initial=0.0))  # how many of them are dense
+    low = 0.0
+    high = float(octaves.max(initial=0.0))  # how many of them are dense
     kept = _on_grids(u, v, octaves)
     if len(u) <= limit or kept.sum() > limit:
         return kept if len(u) > limit else np.ones(len(u), bool)

@@ -211,7 +211,8 @@ def extract(seen: EncodedFrame, model: Trained, resolution: int = 128, label_poi
     Raises ``ValueError`` where the model finds no segment at all.
     """
     names, colors = segment_names(model)
-    seconds, code = dict(seen.timings_s), seen.code
+    seconds = dict(seen.timings_s)
+    code = seen.code
     assert code is not None
     field = partial(model.logits, code)
     with timed(seconds, "locate"):
@@ -255,7 +256,8 @@ def segment_names(model: Trained) -> tuple[Names, SegmentColors]:
 
 def turned_back(result: Reconstruction) -> Reconstruction:
     """Result in the scanner's frame from that in the camera's: half a turn about x reverses the grid along y and z."""
-    T_scanner_camera, grid = inverse_rigid(result.T_camera_input), result.labels
+    T_scanner_camera = inverse_rigid(result.T_camera_input)
+    grid = result.labels
     last = np.asarray(grid.labels.shape) - 1
     corner = grid.origin + grid.spacing * last * np.array([0, 1, 1])
     labels = LabelGrid(
@@ -329,7 +331,8 @@ def count_parts(voxels: VoxelMask) -> int:
 
 def measure(extraction: Extraction, model: Trained | None, code: EncodedCloud | None) -> tuple[SegmentFacts, ...]:
     """Every segment of an extraction in numbers; ``code`` is what ``model`` made of the cloud, None without one."""
-    grid, measured = extraction.grid, list[SegmentFacts]()
+    grid = extraction.grid
+    measured = list[SegmentFacts]()
     owned = zip(extraction.surfaces.segments, extraction.surfaces.owned_volumes, strict=True)
     for label, (segment, volume) in enumerate(owned, start=1):
         voxels = np.argwhere(grid.labels == label)

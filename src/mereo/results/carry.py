@@ -168,7 +168,9 @@ def place(attachments: Sequence[Attachment], registrar: Registrar, frame: CarryF
 
 
 def _placed(attachment: Attachment, T_scene_file: Transform, model: StatisticalModel, solids: Solids) -> Placed:
-    name, content, size = attachment.name, attachment.content, 2 * model.half
+    name = attachment.name
+    content = attachment.content
+    size = 2 * model.half
     if isinstance(content, Volume):
         volume = replace(content, T_world_index=T_scene_file @ content.T_world_index)
         check_overlap(name, volume, T_scene_file, model, solids)
@@ -219,7 +221,8 @@ def _shares(solids: Solids, points: Points) -> tuple[SegmentShares, Values]:
     Outside the share falls with the fourth power of the distance, so that a surface does not tear where another
     segment comes nearer.
     """
-    labels, away = solids.label(points), np.zeros(len(points))
+    labels = solids.label(points)
+    away = np.zeros(len(points))
     shares = np.eye(solids.count)[np.maximum(labels, 1) - 1]
     outside = np.flatnonzero(labels == 0)
     if len(outside):
@@ -341,8 +344,10 @@ class _Fill:
     def around(cls, source: Volume, registration: Registration, interpolation: Interpolation, most: int) -> "_Fill":
         """Grid over the object and the margin, with at most so many voxels, all of them background."""
         margin = MARGIN * registration.model.half * registration.scene_unit
-        spacing, bounds = float(source.spacing.min()) * registration.scene_unit, registration.mesh.bounds
-        size, cell = bounds[1] - bounds[0] + 2 * margin, CELLS[0]
+        spacing = float(source.spacing.min()) * registration.scene_unit
+        bounds = registration.mesh.bounds
+        size = bounds[1] - bounds[0] + 2 * margin
+        cell = CELLS[0]
         while True:
             cells = np.maximum(np.ceil(size / (cell * spacing)).astype(np.int64), 1)
             if (count := int(cells.prod()) * cell**3) <= max(most, cell**3):
@@ -380,7 +385,10 @@ class _Fill:
 
     def segment(self, label: int, todo: VoxelMask, inside: VoxelMask) -> int:
         """Fill one segment's voxels, ``todo``; returns how many of them inside the object were within the source."""
-        open_, inside_, held, shape = todo.reshape(-1), inside.reshape(-1), 0, self.values.shape
+        open_ = todo.reshape(-1)
+        inside_ = inside.reshape(-1)
+        held = 0
+        shape = self.values.shape
         for side in CELLS:
             cells = np.argwhere(todo.reshape([part for n in shape for part in (n // side, side)]).any(axis=(1, 3, 5)))
             corners, right = self._corners(cells, side, label)
@@ -400,7 +408,8 @@ class _Fill:
 
     def _put(self, rows: Indices, index: Points) -> Subset:
         """Fill voxels with the source's values at indices with fractions; returns those that it holds."""
-        source, held = self.source.values, self.source.holds(index)
+        source = self.source.values
+        held = self.source.holds(index)
         if self.interpolation == "nearest":
             nearest = np.clip(np.rint(index).astype(np.int64), 0, np.array(source.shape) - 1)
             sampled = source[tuple(nearest.T)]
@@ -422,7 +431,8 @@ class _Fill:
 
     def _source_index(self, points: Points, label: int) -> Points:
         """Voxel indices, with fractions, of where points that move along with a segment were at rest."""
-        rest, labels = np.empty_like(points), np.full(len(points), label, np.uint8)
+        rest = np.empty_like(points)
+        labels = np.full(len(points), label, np.uint8)
         for part in _parts(len(points), QUERIES_AT_ONCE):
             rest[part] = self.registration.to_rest(points[part], labels[part])
         return self.source.index_of(rest)

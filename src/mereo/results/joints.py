@@ -110,7 +110,8 @@ def _measured(registration: Registration, scene: Scene | None) -> JointValues:
         off = None if reach is None else abs(ends[1] - ends[0]) * float(reach[index])
         if joint.turns:  # a whole turn more is the same state
             turn = 2 * pi * float(np.round((value - (first + second) / 2) / (2 * pi)))
-            value, ends = value - turn, [end - turn for end in ends]
+            value = value - turn
+            ends = [end - turn for end in ends]
         low, high = (-inf, inf) if leader.shares == WHOLE else sorted(ends)
         interval = None if off is None else (max(value - off, low), min(value + off, high))
         values[name] = JointValue(value, interval, unit, (min(first, second), max(first, second)))  # type: ignore[arg-type]
@@ -131,7 +132,8 @@ def _fit_shares(
     least, most = np.transpose([joint.shares for joint in joints])
 
     def misfit(numbers: Float[ndarray, " j"]) -> Float[ndarray, " r"]:
-        moved, shares = np.empty_like(rest), least + numbers * (most - least)
+        moved = np.empty_like(rest)
+        shares = least + numbers * (most - least)
         for label, deform in enumerate(motion.at(dict(zip(leaders, shares.tolist(), strict=True))), start=1):
             moved[labels == label] = deform(rest[labels == label])
         return np.ravel(transform_points(fit_rigid(moved, goal), moved) - goal)
@@ -160,7 +162,8 @@ def _reach(registration: Registration, fit: OptimizeResult, rows: Indices) -> Fl
 
 def segment_poses(registration: Registration) -> NamedPoses:
     """Poses of all segments in the frame: of the links' frames of a robot's file, else of the origin of the files."""
-    source, poses = registration.model.source_frame, NamedPoses()
+    source = registration.model.source_frame
+    poses = NamedPoses()
     for label, name in enumerate(registration.model.rest.names, start=1):
         rest = np.eye(4) if source is None else source.link_frames.get(name, np.eye(4)).copy()
         rest[:3, 3] *= registration.model_scale
@@ -177,7 +180,8 @@ def pose_covariance(registration: Registration) -> Float[ndarray, "6 6"] | None:
     (``Uncertainty.factor``): what the frame leaves open, and other states that explain it alike, by their second
     moments, and for the translation the radius that each point has in addition.
     """
-    target, placed = registration.material, registration.pose()
+    target = registration.material
+    placed = registration.pose()
     source = transform_points(placed, registration.model.source_points(registration.scene_unit))
     arm, aim = source - source.mean(axis=0), target - target.mean(axis=0)
     # The turn w of the best rotation solves sum arm x (aim + shift) = 0 to first order: M w = sum arm x shift
@@ -185,7 +189,8 @@ def pose_covariance(registration: Registration) -> Float[ndarray, "6 6"] | None:
     turn = np.moveaxis(rigid_motion(arm)[:, :, :3] @ turning, 2, 0)
     lever = target.mean(axis=0) - placed[:3, 3]
     shift = np.eye(3)[:, None] / len(arm) - np.cross(turn, lever, axisa=0, axisc=0)
-    moves, sure = _moves(registration, np.concatenate([turn, shift])), registration.uncertainty
+    moves = _moves(registration, np.concatenate([turn, shift]))
+    sure = registration.uncertainty
     if moves is None or sure is None:
         return None
     factor = np.hstack(moves)

@@ -180,7 +180,9 @@ def state_of(
 
     Raises ``ValueError`` for draws without their scene.
     """
-    model, drawn, draws = registration.model, registration.drawn, None
+    model = registration.model
+    drawn = registration.drawn
+    draws = None
     if drawn is None:
         unposed = model.material(registration.z)
     elif isinstance(scene, str):
@@ -257,7 +259,8 @@ def restored(state: RegistrationState, model: StatisticalModel, scene: Scene | N
             f"{state.weights!r}); its numbers mean nothing here: give the model of those weights, or without any the "
             "object as it was looked for, with the joints that were known"
         )
-    z, drawn = np.array(state.z, float), None
+    z = np.array(state.z, float)
+    drawn = None
     if state.draws is None:
         if len(z) != model.count:
             raise ValueError(

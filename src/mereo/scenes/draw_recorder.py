@@ -93,7 +93,8 @@ class Recorder(NamedGenerator):
     def _take(self, kind: str, shape: WholeNumbers, low: Any, high: Any) -> Shares:
         if self._most is not None and len(self.calls) >= self._most:
             raise OutOfDraws
-        trail, name = _trail(), self.take_name()
+        trail = _trail()
+        name = self.take_name()
         steps = tuple((code.co_filename, code.co_firstlineno, instruction) for code, instruction in trail)
         place = (steps, name)
         key = (place, self._seen[place])
@@ -161,7 +162,8 @@ class Recorder(NamedGenerator):
         if not replace and size is not None:
             return super().choice(a, size, replace, p, axis, shuffle)
         options = _options(a)
-        count, shape = options.shape[axis], _shape(size)
+        count = options.shape[axis]
+        shape = _shape(size)
         self._ends = ends = np.cumsum(np.full(count, 1 / count) if p is None else p)
         shares = self._take("choice", shape, 0, count).reshape(shape)
         index = np.minimum(np.searchsorted(ends, shares, side="right"), count - 1)

@@ -64,7 +64,8 @@ class Mechanism(StatisticalModel):
     @classmethod
     def of(cls, scene: Scene | None, model: StatisticalModel) -> StatisticalModel:
         """Mechanism of a scene and of its statistical model; that itself where more moves than joints with names."""
-        linear, motion = model.registered, joints_alone(scene)
+        linear = model.registered
+        motion = joints_alone(scene)
         if isinstance(model, Mechanism) and model.chain is motion:
             return model
         if motion is None:
@@ -106,7 +107,8 @@ class Mechanism(StatisticalModel):
         """
         joints = [(joint.turns, unit(joint.axis), joint.pivot) for joint, _ in self.chain.joints.values()]
         twists = [(*axis, *np.cross(at, axis)) if turns else (0.0, 0.0, 0.0, *axis) for turns, axis, at in joints]
-        vectors, matrices = np.reshape(twists, (-1, 6)), np.zeros((len(joints), 4, 4))
+        vectors = np.reshape(twists, (-1, 6))
+        matrices = np.zeros((len(joints), 4, 4))
         matrices[:, :3, :3], matrices[:, :3, 3] = np.cross(np.eye(3), vectors[:, None, :3]), vectors[:, 3:]
         return vectors, matrices
 
@@ -114,7 +116,8 @@ class Mechanism(StatisticalModel):
         """Share, of what a joint has of its range, at which it is, and the derivative by its number."""
         if name not in self.free:
             return np.full(z.shape[:-1], 0.5), np.zeros(z.shape[:-1])
-        joint, number = self.chain.joints[name][0], np.asarray(z[..., self.free.index(name)], dtype=float)
+        joint = self.chain.joints[name][0]
+        number = np.asarray(z[..., self.free.index(name)], dtype=float)
         turn = abs(joint.limits[1] - joint.limits[0]) * (joint.shares[1] - joint.shares[0])
         if joint.turns and abs(turn - 2 * np.pi) < NEARLY:  # as variable as what is uniform
             return np.asarray(0.5 + number / np.sqrt(12.0)), np.full(number.shape, 1 / np.sqrt(12.0))
@@ -129,8 +132,10 @@ class Mechanism(StatisticalModel):
 
     @lru_cache(maxsize=8)  # noqa: B019 (a few states of a few mechanisms)
     def _motions(self, numbers: bytes, states: int) -> Motions:
-        z, count = np.frombuffer(numbers).reshape(states, len(self.free)), len(self.vertex_counts)
-        T, twists = np.tile(np.eye(4), (states, count, 1, 1)), np.zeros((states, count, 6, len(self.free)))
+        z = np.frombuffer(numbers).reshape(states, len(self.free))
+        count = len(self.vertex_counts)
+        T = np.tile(np.eye(4), (states, count, 1, 1))
+        twists = np.zeros((states, count, 6, len(self.free)))
         for vector, twist, (joint, members) in zip(*self._twists, self.chain.joints.values(), strict=True):
             name, rows, (first, last) = joint.follows or joint.name, list(members), joint.limits
             (low, high), (share, slope) = self.chain.joints[name][0].shares, self._share(name, z)
@@ -151,10 +156,13 @@ class Mechanism(StatisticalModel):
 
     def positions(self, z: Float[ndarray, "n k"], rows: Rows = slice(None)) -> Float[ndarray, "n r 3"]:
         """Positions of some material points in states, unposed."""
-        rest, owners, T = self.rest_points[rows], self.labels[rows] - 1, self.motions(z)[0]
+        rest = self.rest_points[rows]
+        owners = self.labels[rows] - 1
+        T = self.motions(z)[0]
         result = np.empty((len(z), *rest.shape))
         for owner in np.unique(owners):
-            part, each = owners == owner, T[:, owner]
+            part = owners == owner
+            each = T[:, owner]
             result[:, part] = rest[part] @ each[:, :3, :3].transpose(0, 2, 1) + each[:, None, :3, 3]
         return result
 
@@ -198,7 +206,8 @@ class Mechanism(StatisticalModel):
 
 def _of_twists(T: Float[ndarray, "*n 4 4"]) -> Float[ndarray, "*n 6 6"]:
     """Matrix that moves twists as a rigid motion moves points."""
-    R, moves = T[..., :3, :3], np.zeros((*T.shape[:-2], 6, 6))
+    R = T[..., :3, :3]
+    moves = np.zeros((*T.shape[:-2], 6, 6))
     moves[..., :3, :3] = moves[..., 3:, 3:] = R
     moves[..., 3:, :3] = (T[..., :3, 3] @ CROSS.reshape(3, 9)).reshape(R.shape) @ R
     return moves

@@ -375,7 +375,8 @@ def with_joints(scene: Scene | None, given: Any) -> Scene:
         before = shares.get(leader, given_before)
         least, most = _shares(joint, value, within, before, scene.unit_m or 1.0)
         if before != (0.0, 1.0):  # of a joint of which nothing is known a whole turn goes on beyond its limits
-            least, most = max(least, before[0]), min(most, before[1])
+            least = max(least, before[0])
+            most = min(most, before[1])
         if least > most + ROUNDING:
             others, cure = (
                 ("what was given before, with the object", "leave one of both out")
@@ -465,7 +466,8 @@ def _shares(joint: JointSampler, value: float, within: float, before: Range, uni
         return low, high
     if low > 1 + ROUNDING or high < -ROUNDING:
         least, most = sorted((first, second))
-        limits, words = f"{least:.6g} to {most:.6g} {name}", "radians" if joint.turns else "metres"
+        limits = f"{least:.6g} to {most:.6g} {name}"
+        words = "radians" if joint.turns else "metres"
         text = f"joint {joint.name!r} is {stated:.6g}; its limits are {limits}: "
         raise ValueError(f"{text}give {words}, correct it, or add `within`")
     least, most = np.clip([low, high], 0.0, 1.0).tolist()

@@ -106,7 +106,8 @@ def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED, *, q
 
     That of one elastic solid has its very modes. The progress of its states is shown unless ``quiet``.
     """
-    frame, scene = scene.source_frame, scene.for_seed(seed)
+    frame = scene.source_frame
+    scene = scene.for_seed(seed)
     nodes, labels = interior_nodes(scene.rest)
     solid = elastic_motion(scene.sample_deformations)
     if solid is not None:

@@ -207,7 +207,8 @@ def _surface_frames(
     """Frames; ``ValueError`` for vertices that do not match ``rest`` and for the first frame that is inside out."""
     ordered = []
     for segment in rest.segments:
-        states, known = record.vertices[segment.name], record.rest.get(segment.name)
+        states = record.vertices[segment.name]
+        known = record.rest.get(segment.name)
         known = None if known is None else known * scale + shift
         ordered.append(states[:, _order(path, segment, states.shape[1], known)])
     surfaces = tuple(Surface(segment.vertices, segment.faces) for segment in rest.segments)

@@ -88,7 +88,8 @@ def kept_distances(
     """
     rng = default_rng(0)
     first, second = np.triu_indices(len(tried), 1)
-    middle, motion = mean[tried].astype(np.float32), modes[tried]
+    middle = mean[tried].astype(np.float32)
+    motion = modes[tried]
     states = library[rng.permutation(len(library))[:TRIED_STATES]]
     real = _distances(middle, motion, states)[:, first, second]
     drawn = rng.normal(size=(TRIED_GAUSSIAN, library.shape[1])).astype(np.float32)
@@ -304,7 +305,8 @@ class StatisticalModel:
 
         A coefficient that any state of the library reaches is within; lengths are scene units.
         """
-        low, high = self.library.min(axis=0), self.library.max(axis=0)
+        low = self.library.min(axis=0)
+        high = self.library.max(axis=0)
         excess = np.maximum(np.maximum(z - high, low - z), 0.0) * self.motion
         return float(np.sqrt((excess**2).sum()))
 
@@ -319,7 +321,8 @@ class StatisticalModel:
 
         A normal number is as rarely as large. Beyond all of the library, it goes on as from its median to its largest.
         """
-        levels, middle = self._squares, np.median(self._squares)
+        levels = self._squares
+        middle = np.median(self._squares)
         level = np.log(max((z**2).mean(), np.finfo(float).tiny))
         within = np.interp(level, levels, ndtri((np.arange(len(levels)) + 0.5) / len(levels)))
         far = (level - middle) / max(levels[-1] - middle, np.finfo(float).eps)
@@ -373,7 +376,8 @@ def following(anchors: tuple[Anchors, ...], points: Points, labels: Labels) -> P
 #
 # Notation: v vertices, m material points, k modes, n states, q pairs.
 
-LIBRARY_STEP, WIDE_MODES = 1 / 32, 12
+LIBRARY_STEP = 1 / 32
+WIDE_MODES = 12
 """Step of a coefficient, whose bytes reach to 4 standard deviations, and how many first modes have two bytes."""
 
 
@@ -500,8 +504,11 @@ def _narrow(index: ndarray) -> ndarray:
 
 def _rest(tensors: Tensors, facts: Facts) -> SegmentedMesh:
     """The segments at rest."""
-    vertices, faces = tensors["vertices"].astype(float), tensors["faces"].astype(np.int64)
-    first, start, segments = 0, 0, []
+    vertices = tensors["vertices"].astype(float)
+    faces = tensors["faces"].astype(np.int64)
+    first = 0
+    start = 0
+    segments = []
     for name, color, solid, points, triangles in zip(
         *(facts[key] for key in ("names", "colors", "solid", "vertices", "faces")), strict=True
     ):

@@ -41,7 +41,9 @@ class Capsule:
 
     def _end_hit(self, center: Vector, rays: Points) -> Values:
         """Entry into the ball around one end: the smaller root of |t ray - center| = radius."""
-        a, b, c = np.einsum("ij,ij->i", rays, rays), rays @ center, center @ center - self.radius**2
+        a = np.einsum("ij,ij->i", rays, rays)
+        b = rays @ center
+        c = center @ center - self.radius**2
         return _entry(a, b, np.full(len(rays), c))
 
     def _side_hit(self, rays: Points) -> Values:
@@ -51,7 +53,8 @@ class Capsule:
         if length == 0:
             return np.full(len(rays), inf)
         axis = axis / length
-        along, offset = rays @ axis, float(self.start @ axis)
+        along = rays @ axis
+        offset = float(self.start @ axis)
         across, start = rays - along[:, None] * axis, self.start - offset * axis
         distance = _entry(
             np.einsum("ij,ij->i", across, across), across @ start, np.full(len(rays), start @ start - self.radius**2)
@@ -159,7 +162,9 @@ def _approach(seen: Points, reach: float, unit: float, rng: Generator) -> tuple[
 def _sample_tool(seen: Points, reach: float, unit: float, rng: Generator) -> list[Capsule]:
     """Random straight shaft that ends in two jaws, as laparoscopic instruments have: 5 to 12 mm thick."""
     tip, out = _approach(seen, reach, unit, rng)
-    radius, jaw, opening = rng.uniform(0.0025, 0.006) * unit, 0.018 * unit, rng.uniform(0.05, 0.4)
+    radius = rng.uniform(0.0025, 0.006) * unit
+    jaw = 0.018 * unit
+    opening = rng.uniform(0.05, 0.4)
     axis = (out - tip) / norm(out - tip)
     across = np.cross(axis, rng.normal(size=3))
     across /= norm(across)
@@ -178,8 +183,10 @@ def _sample_hand(seen: Points, reach: float, unit: float, rng: Generator) -> lis
     An adult's: about 18 cm long, 8 cm wide, with 10 % of variation. Fingers bend away from the camera by random angles.
     """
     tip, out = _approach(seen, reach, unit, rng)
-    size, mirror = unit * rng.uniform(0.9, 1.1), rng.choice([-1.0, 1.0])
-    frame, reach_m = _hand_frame(tip, out, rng), 0.18 - rng.uniform(0, 0.07)
+    size = unit * rng.uniform(0.9, 1.1)
+    mirror = rng.choice([-1.0, 1.0])
+    frame = _hand_frame(tip, out, rng)
+    reach_m = 0.18 - rng.uniform(0, 0.07)
 
     def part(start: Vector, end: Vector, radius: float) -> Capsule:
         """From (across, along, away) in metres, seen from the wrist."""
@@ -208,5 +215,6 @@ def _hand_frame(tip: Vector, out: Vector, rng: Generator) -> Matrix:
     away /= norm(away)
     across = np.cross(along, away)
     roll = rng.uniform(-pi / 4, pi / 4)
-    cosine, sine = np.cos(roll), np.sin(roll)
+    cosine = np.cos(roll)
+    sine = np.sin(roll)
     return np.stack([cosine * across + sine * away, along, cosine * away - sine * across])

@@ -196,7 +196,8 @@ class GenerateConfig:
         Nor of the workspace where it is the scene's own.
         """
         stated = asdict(self)
-        names, place = stated.pop("observations") and list(self.further), stated.pop("workspace")
+        names = stated.pop("observations") and list(self.further)
+        place = stated.pop("workspace")
         sensors = {name: asdict(sensor) for name, sensor in self.further.items()}
         stated |= {"observations": names, "sensors": sensors} if names else {}
         return stated | ({} if place == "own" else {"workspace": place})

@@ -171,7 +171,8 @@ def add_axial_noise(depth: PixelValues, angle_rad: PixelValues, sensor: SensorCo
     measured = depth > 0
     z_m = depth[measured] * sensor.metres_per_unit
     std_m = sensor.axial * axial_std_m(z_m, angle_rad[measured], sensor.model)
-    noisy, noise_m = depth.copy(), std_m * rng.normal(size=depth.shape)[measured]
+    noisy = depth.copy()
+    noise_m = std_m * rng.normal(size=depth.shape)[measured]
     noisy[measured] = np.maximum(z_m + noise_m, np.finfo(np.float32).tiny) / sensor.metres_per_unit
     return noisy
 
@@ -235,7 +236,8 @@ def sample_holes(
     v, u = np.ogrid[: depth.shape[0], : depth.shape[1]]
     for chosen in rng.integers(len(rows), size=rng.poisson(sensor.holes)):
         row, column = rows[chosen], columns[chosen]
-        radii_m, angle = rng.gamma(5.0, sensor.hole_radius_m / 5.0, size=2), rng.uniform(0, pi)
+        radii_m = rng.gamma(5.0, sensor.hole_radius_m / 5.0, size=2)
+        angle = rng.uniform(0, pi)
         a, b = radii_m * focal_px / (depth[row, column] * sensor.metres_per_unit)
         along = (u - column) * np.cos(angle) + (v - row) * np.sin(angle)
         across = (v - row) * np.cos(angle) - (u - column) * np.sin(angle)
@@ -263,7 +265,8 @@ def sample_mask(seen: PixelMask, sensor: SensorConfig, streams: dict[str, Genera
 @lru_cache(maxsize=8)
 def _bumps(size: int, nodes: int) -> Float[ndarray, "s n"]:
     """Weights of the nodes at each pixel; their squares sum to 1."""
-    pixels, centers = np.arange(size)[:, None] / max(size - 1, 1), np.linspace(0, 1, nodes)
+    pixels = np.arange(size)[:, None] / max(size - 1, 1)
+    centers = np.linspace(0, 1, nodes)
     weights = np.exp(-0.5 * ((pixels - centers) * (nodes - 1) / 0.7) ** 2)
     return unit_rows(weights)
 

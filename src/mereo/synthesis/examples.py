@@ -245,7 +245,8 @@ def _observed_points(
     seen = observe(solids, first.camera, noise_std, sensor, rng)
     if seen.object_points < MIN_POINTS:
         return None
-    points, shows_object = seen.image.to_points().points, (seen.source == OBJECT)[seen.image.valid]
+    points = seen.image.to_points().points
+    shows_object = (seen.source == OBJECT)[seen.image.valid]
     if way < UNCLEANED:
         return points
     keep = without_strays(points) if way < UNCLEANED + BY_RULE else shows_object

@@ -81,7 +81,8 @@ def owner_labels(shape: Shape, points: Places) -> Labels:
 MAX_DRAWS = 2_000_000
 """Number of draws for one segment after which sampling gives up: its share of its box is too small for it."""
 
-_FIRST_BATCH, _LARGEST_BATCH = 8, 1 << 17
+_FIRST_BATCH = 8
+_LARGEST_BATCH = 1 << 17
 """The first batch draws so many times n: a segment usually fills a tenth to a quarter of its extended box."""
 
 
@@ -202,10 +203,12 @@ class _Draws:
         return True
 
     def _give_up(self, inside: int, outside: int) -> NoReturn:
-        hits, where = inside, "inside it"
+        hits = inside
+        where = "inside it"
         cure = "check that it is closed and no earlier segment covers it, or split it into shorter parts"
         if inside >= self.need:
-            hits, where = outside, "outside it" if self.outside.sum() > 1 else "in the empty space around it"
+            hits = outside
+            where = "outside it" if self.outside.sum() > 1 else "in the empty space around it"
             cure = "widen box_margin, or use nested-sort-sample for a segment enclosed by others"
         raise ValueError(
             f"segment {self.index} has {hits} of {MAX_DRAWS:,} draws {where}; {self.need} are needed: {cure}"
@@ -262,7 +265,8 @@ def _nearest_rows(shape: Shape, index: int, points: Places, keep: int) -> ndarra
     if len(rest):
         gap, pivot = cKDTree(points[known]).query(points[rest])
         bound = np.maximum(distance[known][pivot] - gap, to_box[rest])
-        rest, bound = rest[np.argsort(bound)], np.sort(bound)
+        rest = rest[np.argsort(bound)]
+        bound = np.sort(bound)
     while len(rest):
         chunk = rest[: min(keep, int(np.searchsorted(bound, _keep_th(distance, keep))))]
         if len(chunk) == 0:

@@ -73,7 +73,8 @@ def walk(scene: Scene, seed: int, times_s: Values, change_s: float) -> list[Play
     """
     start = random_state(scene, seed)
     path = _Path.of(scene, start, seed, times_s / change_s)
-    states, places = list[Played](), list[ndarray]()
+    states = list[Played]()
+    places = list[ndarray]()
     step = np.diff(times_s, prepend=0.0) * FASTEST * rest_frame(scene.rest)[1]
     tries = 0
     while len(states) < len(times_s):
@@ -115,7 +116,8 @@ def switches(scene: Scene, start: Played) -> set[Key]:
             continue
         for share in EXTREMES:
             given = {**start.remembered, call.key: np.array([share])}
-            recorder, whole = Recorder(start.seed, given, 2 * len(start.calls) + 10), False
+            recorder = Recorder(start.seed, given, 2 * len(start.calls) + 10)
+            whole = False
             with suppress(OutOfDraws, ValueError):
                 play(scene, recorder)
                 whole = True
@@ -155,7 +157,8 @@ class _Path:
         moving = [call.kind in SMOOTH and call.key not in fixed for call in start.calls]
         parts = [call.shares for call, moves in zip(start.calls, moving, strict=True) if moves]
         first = ndtri(np.concatenate([np.empty(0), *parts]))
-        rng, weights = example_rng(seed, 1), process_weights(times)
+        rng = example_rng(seed, 1)
+        weights = process_weights(times)
         nodes = rng.normal(size=(weights.shape[1], len(first)))
         # the walk begins at the start: the nodes that count at time 0 agree with it
         nodes += np.outer(weights[0], first - weights[0] @ nodes)
@@ -165,7 +168,8 @@ class _Path:
         """Shares of all draws at time i."""
         z = self.weights[i] @ self.nodes
         z = np.sqrt(1 - self.reach**2) * self.first + self.reach * z if self.reach < 1 else z
-        result, at = {}, 0
+        result = {}
+        at = 0
         for call, moves in zip(self.start.calls, self.moving, strict=True):
             count = len(call.shares)
             result[call.key] = ndtr(z[at : at + count]) if moves else call.shares
@@ -231,7 +235,8 @@ def sequence(scene: Scene, settings: SequenceConfig, sensor: SensorConfig, seed:
     states = walk(scene, seed, times, settings.change)
     aims = _camera_aims(scene.workspace, times / settings.camera_change, example_rng(seed, 2))
     camera = Camera.from_fov(settings.image_size, settings.image_size, scene.workspace.fov_rad)
-    rng, clear = example_rng(seed, 3), replace(sensor, tool=0.0, hand=0.0)
+    rng = example_rng(seed, 3)
+    clear = replace(sensor, tool=0.0, hand=0.0)
     meshes = (scene.deform(played.deformations).mesh for played in states)
     around: _Around | None = None
     for time_s, played, aimed_at, mesh in zip(times, states, aims, meshes, strict=True):
@@ -360,7 +365,10 @@ def write_recording(
     """
     unit_m = sensor[1].metres_per_unit if scene.unit_m is None else scene.unit_m
     (folder / FRAMES).mkdir()
-    frames, states, scale, camera = [], [], FINEST, None
+    frames = []
+    states = []
+    scale = FINEST
+    camera = None
     digits = max(4, len(str(settings.frames - 1)))
     for number, moment in enumerate(sequence(scene, settings, sensor[1], seed)):
         image = moment.seen.image

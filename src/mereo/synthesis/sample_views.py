@@ -101,5 +101,6 @@ def _view_of(stored: dict[str, np.ndarray]) -> SampleView:
     grid = LabelGrid(stored["labels"], stored["origin"], stored["spacing"], names)
     depth = DepthImage(stored["depth"] * float(stored["depth_step"]), camera)
     unit_m = float(stored.get("unit_m", np.nan))  # files from before it was kept do not say
-    truth, known = TruthGrid(grid, stored["kept"]), np.isfinite(unit_m)
+    truth = TruthGrid(grid, stored["kept"])
+    known = np.isfinite(unit_m)
     return SampleView(str(stored["scene"]), int(stored["seed"]), depth, truth, unit_m if known else None)

@@ -142,11 +142,14 @@ def cloud_picture(points: Points, view: Viewpoint, size: Size) -> Picture:
 
 def legend(names: Sequence[str], colors: Sequence[Color], width: int) -> Picture:
     """Strip with a swatch and a name for each segment, in as many rows as are needed."""
-    corners, x, y = [], 12, 6
+    corners = []
+    x = 12
+    y = 6
     for name in names:
         length = 22 + int(font(15).getlength(name)) + 20
         if x > 12 and x + length > width:
-            x, y = 12, y + 26
+            x = 12
+            y = y + 26
         corners.append((x, y))
         x += length
     strip = Image.new("RGB", (width, y + 30), "white")

@@ -74,7 +74,8 @@ def points_on_segments(
         sides: viewing direction and up of each, as in ``CAMERA_VIEWS``.
         size: width and height in pixels; what is shown fills it.
     """
-    pictures, bounds = list[Picture](), _joint_bounds(points, surfaces)
+    pictures = list[Picture]()
+    bounds = _joint_bounds(points, surfaces)
     for direction, up in sides:
         view = Viewpoint.along(bounds, direction, up)
         canvas = shaded_canvas(surfaces, view, (size, size))

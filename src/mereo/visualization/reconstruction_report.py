@@ -174,7 +174,8 @@ def _base64(array: ndarray) -> str:
 
 def _fit(surfaces: SegmentedMesh, extent: float, room_bytes: int) -> list[Segment]:
     """The segments, split at their creases, and coarsened together until they take at most ``room_bytes``."""
-    shown, cells = [split_at_creases(segment)[0] for segment in surfaces.segments], 400.0
+    shown = [split_at_creases(segment)[0] for segment in surfaces.segments]
+    cells = 400.0
     while (size := sum(7 * len(s.vertices) + 12 * len(s.faces) for s in shown)) > room_bytes and cells > 4:
         shown = [split_at_creases(cluster(segment, extent / cells))[0] for segment in surfaces.segments]
         # a surface meets about cells^2 cells of the grid; the factor keeps the last steps from crawling
@@ -248,7 +249,8 @@ def trust(summary: Facts) -> Trust:
         summary: its ``recognition`` and ``registration`` are read.
     """
     recognition, registration = _block(summary, "recognition"), _block(summary, "registration")
-    known, explained = recognition.get("known"), _number(registration.get("explained"))
+    known = recognition.get("known")
+    explained = _number(registration.get("explained"))
     if known is True and explained is not None and registration.get("accepted") is not False:
         share = f"{100 * explained:.1f}\N{NO-BREAK SPACE}% of the points"
         return Trust("yes", f"the frame shows the object; the model explains {share}")
@@ -287,7 +289,8 @@ STAGES = {
 """What each stage of ``timings_s`` does; another one keeps its name."""
 
 DEVICES = {"cpu": "the processor", "cuda": "the GPU"}
-DASH, GAP = "\N{EN DASH}", 3 * "\N{NO-BREAK SPACE}"
+DASH = "\N{EN DASH}"
+GAP = 3 * "\N{NO-BREAK SPACE}"
 """For what there is no number of; between coordinates, which have commas at their thousands."""
 
 
@@ -357,7 +360,8 @@ def _facts(summary: Facts, unit: Unit, verdict: Trust) -> list[str]:
     """Where the answer comes from, how sure it is, and what it was made with."""
     registration, radius95 = summary.get("registration"), summary.get("radius95")
     facts = [_answer(registration, verdict)] if isinstance(registration, Mapping) else []
-    source, spacing = summary.get("source"), _number(summary.get("spacing"))
+    source = summary.get("source")
+    spacing = _number(summary.get("spacing"))
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
     if isinstance(radius95, Mapping):
@@ -397,7 +401,8 @@ def _warnings(summary: Facts, verdict: Trust) -> list[str]:
 
 
 def _row(segment: Facts, unit: Unit) -> list[Any]:
-    centre, volume = segment.get("centroid"), _number(segment.get("volume"))
+    centre = segment.get("centroid")
+    volume = _number(segment.get("volume"))
     radius = _number(segment.get("centroid_radius95"))
     words = DASH if centre is None or _number(centre[0]) is None else unit.place(np.asarray(centre, float), radius)
     place, sign, off = words.partition(" ± ")
@@ -509,7 +514,9 @@ def read_report(path: Path) -> WrittenReport | None:
         return None
     try:
         page = json.loads(text)
-        words, low, high = page["words"], np.array(page["low"], float), np.array(page["high"], float)
+        words = page["words"]
+        low = np.array(page["low"], float)
+        high = np.array(page["high"], float)
         steps = np.frombuffer(base64.b64decode(page["cloud"]["positions"]), "<u2").reshape(-1, 3)
         level, *sentences = words["trust"]
         if level not in VERDICTS:
@@ -571,7 +578,8 @@ def result_html(
         f'<figcaption style="text-align:center;font-size:smaller">{escape(name)}</figcaption></figure>'
         for name, picture in zip(SIDES, pictures, strict=True)
     )
-    title, text = escape(summary["title"]), "<br>".join(escape(line) for line in lines)
+    title = escape(summary["title"])
+    text = "<br>".join(escape(line) for line in lines)
     return (
         f'<div><p style="margin:0 0 6px"><b>{title}</b><br>{text}</p>'
         f'<div style="display:flex;gap:8px;flex-wrap:wrap">{figures}</div>'
@@ -580,7 +588,8 @@ def result_html(
 
 
 def _table(summary: Facts, surfaces: SegmentedMesh, unit: Unit) -> str:
-    heads, rows = _heads(summary, unit), []
+    heads = _heads(summary, unit)
+    rows = []
     for segment, (red, green, blue) in zip(summary["segments"], surfaces.colors, strict=True):
         swatch = f'<span style="color:rgb({red},{green},{blue})">&#9632;</span>'
         *lengths, sure = _row(segment, unit)

@@ -163,7 +163,8 @@ class Canvas:
         index = np.flatnonzero(nearer)
         normal = unit_rows(np.einsum("nk,nkd->nd", bary[index], normals[face[index]]))
         light = _light(normal, unit_rows(directions[index]))
-        rgb, depth = self.rgb.reshape(-1, 3), self.depth.reshape(-1)
+        rgb = self.rgb.reshape(-1, 3)
+        depth = self.depth.reshape(-1)
         rgb[index] = np.clip(shown.colors[face[index]] * light[:, :1] + light[:, 1:], 0, 1)
         depth[index] = z.ravel()[index]
         part = np.where(nearer, np.append(shown.owner, -1)[face], -1).reshape(height, width)
@@ -188,7 +189,8 @@ class Canvas:
         steps = np.arange(-int(radius), int(radius) + 1)
         # all discs, far to near, so that the nearest is written last
         order = np.argsort(-in_view[:, 2], kind="stable")
-        corner, z = np.floor(center[order]).astype(np.int64), in_view[order, 2]
+        corner = np.floor(center[order]).astype(np.int64)
+        z = in_view[order, 2]
         for dx, dy in ((x, y) for x in steps for y in steps if x * x + y * y <= radius * radius):
             self._put(corner + np.array([dx, dy]), z, colors[order])
 
@@ -275,7 +277,8 @@ def shade(
 
 def shaded_canvas(mesh: SegmentedMesh, view: Viewpoint, size: Size, colors: list[Color] | None = None) -> Canvas:
     """``shade`` before it is finished: more can be drawn on it."""
-    canvas, colors = Canvas.empty(view, size), list(mesh.colors) if colors is None else colors
+    canvas = Canvas.empty(view, size)
+    colors = list(mesh.colors) if colors is None else colors
     canvas.draw_triangles(Triangles.of(mesh, colors))
     if inner := sorted({index for index, _ in enclosed(mesh)}):
         within = Canvas.empty(view, size)

@@ -72,7 +72,8 @@ def summary_of(
         {**asdict(segment), **({} if fit is None else {"pose": poses[segment.name]}), "color": color}
         for segment, color in zip(result.segments, result.surfaces.colors, strict=True)
     ]
-    radii, sure = JsonObject(), None if fit is None else fit.uncertainty
+    radii = JsonObject()
+    sure = None if fit is None else fit.uncertainty
     if fit is not None and sure is not None:
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
@@ -116,7 +117,8 @@ def write_answer(
     reconstruction, frame = answer.reconstruction, answer.seen.frame
     started = time.perf_counter()
     formats = chosen_formats(files.formats)
-    results, to_viewer = _results(answer, files), to_viewer_of(frame)
+    results = _results(answer, files)
+    to_viewer = to_viewer_of(frame)
     write_formats(directory, [name for name in formats if name != "json"], results)  # which states the time of these
     for item in carried:
         write_attachment(directory / "carried" / item.name, item.content, results.factor, to_viewer, frame.metres)
@@ -157,7 +159,8 @@ def write_answer_file(path: Path, suffix: str, answer: Answer, files: FilesConfi
 def _results(answer: Answer, files: FilesConfig) -> Results:
     """What the writers of all formats are given."""
     result, frame = answer.reconstruction, answer.seen.frame
-    radii, to_viewer = radii_of(answer.registered), to_viewer_of(frame)
+    radii = radii_of(answer.registered)
+    to_viewer = to_viewer_of(frame)
     parts = result.surfaces, result.labels, result.observed
     return Results(*parts, to_viewer, frame.metres, files.millimetres, radii=radii)
 
@@ -170,7 +173,8 @@ def to_viewer_of(frame: SensorFrame) -> Matrix:
 def report_of(answer: Answer, surfaces: SegmentedMesh, summary: JsonObject) -> Report:
     """Page of an answer with these surfaces, which may be coarser and more than its own."""
     frame, cloud = answer.seen.frame, answer.seen.cloud
-    to_viewer, unit = to_viewer_of(frame), Unit(frame.unit_m)
+    to_viewer = to_viewer_of(frame)
+    unit = Unit(frame.unit_m)
     return Report(cloud, surfaces, summary, to_viewer, unit, answer.registered, frame.depth)
 
 

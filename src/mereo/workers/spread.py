@@ -126,7 +126,8 @@ def spread(
         if min(workers, len(items)) <= 1:
             yield from ((item, attempt(item, partial(function, item))) for item in items)
             return
-    waiting, running = iter(items), dict[Future[Result], Item]()
+    waiting = iter(items)
+    running = dict[Future[Result], Item]()
     with _ray_pool(function, workers) if isinstance(workers, Cluster) else process_pool(function, workers) as submit:
         while True:
             slots = max(1, task_slots(workers)) if isinstance(workers, Cluster) else workers  # a cluster may grow

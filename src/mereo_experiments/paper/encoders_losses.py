@@ -36,7 +36,8 @@ def recipe(scale: ExperimentScale, encoder: Encoder, loss: Loss) -> TrainConfig 
 
 def features(config: TrainConfig) -> tuple[str, ...]:
     """Words for what a recipe adds to the paper's (docs/learning.md)."""
-    additions, augment = config.network.additions, replace(config.augment, observations=AugmentConfig.observations)
+    additions = config.network.additions
+    augment = replace(config.augment, observations=AugmentConfig.observations)
     added = {
         "local features": additions.local_neighbors,
         "lines of sight": additions.sight_neighbors,
@@ -55,7 +56,8 @@ def features(config: TrainConfig) -> tuple[str, ...]:
 def lacks(scale: ExperimentScale, encoder: Encoder, loss: Loss) -> str:
     """Words for what an encoder's recipe lacks of those that another encoder's has; empty where all are alike."""
     each = {name: recipe(scale, name, loss) for name in ENCODERS}
-    chosen, others = each[encoder], [result for name, result in each.items() if result is not None and name != encoder]
+    chosen = each[encoder]
+    others = [result for name, result in each.items() if result is not None and name != encoder]
     assert chosen is not None, "encoder and loss always go together here"
     everything = dict.fromkeys(name for config in others for name in features(config))
     return ", ".join(name for name in everything if name not in features(chosen))

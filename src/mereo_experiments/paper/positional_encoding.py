@@ -15,7 +15,8 @@ OBJECTS = ("rope", "shapes", "lizard", "robot", "human")
 
 def run(store: Store, scale: ExperimentScale) -> Result:
     """Result of two trainings per object, with and without the encoding, that differ in nothing else."""
-    rows, holds = [], {}
+    rows = []
+    holds = {}
     for scene in scale.choose(OBJECTS):
         paper = published()["positional-encoding"].get(scene, {})
         dataset = store.dataset(scene, GenerateConfig(), scale.examples)

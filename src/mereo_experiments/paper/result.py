@@ -145,7 +145,8 @@ def markdown(result: Result) -> str:
     lines = [f"# {result.title}", "", f"Scale `{result.scale}`. {' '.join(result.notes)}".rstrip(), ""]
     lines += [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
     for row in result.rows:
-        score, paper = row.score, row.paper or {}
+        score = row.score
+        paper = row.paper or {}
         ours = (score.iou, score.miou, score.example_iou, score.example_miou)
         figures = [*ours, paper.get("iou", float("nan")), paper.get("miou", float("nan"))]
         cells = [row.object, row.variant, *(format_score(value, "") for value in figures), *[row.lacks] * lacking]

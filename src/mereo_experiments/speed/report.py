@@ -131,7 +131,8 @@ def _cost(exact: Model, fast: Model, view: SampleView) -> Cost:
     cloud = view.depth.to_points()
     points = random_points(view, QUERIES, seed=1)
     code = exact.encode(cloud)
-    exact_answer, fast_answer = exact.query(code, points), fast.query(fast.encode(cloud), points)
+    exact_answer = exact.query(code, points)
+    fast_answer = fast.query(fast.encode(cloud), points)
     change = np.abs(exact_answer.distance - fast_answer.distance).mean() * code.normalizer.scale
     return Cost(float((exact_answer.label != fast_answer.label).mean()), float(change))
 

@@ -255,7 +255,8 @@ class Bench:
     def prepare(self) -> Stage:
         """Times from depth image to normalized points in farthest-point order."""
         cloud = self.view.depth.to_points()
-        points, kept = len(cloud), self.model.network.config.points
+        points = len(cloud)
+        kept = self.model.network.config.points
         # each chosen point is compared with all: differences, squares, sums and the smaller distance
         work = Work(operations=9.0 * points * min(points, kept), bytes=float(self.view.depth.depth.nbytes))
         return self._stage("preprocessing", work, lambda: self.model.normalized_cloud(self.view.depth.to_points()))
@@ -307,7 +308,8 @@ class Bench:
     def surfaces(self) -> Stage:
         """Times of closed meshes of all segments, 128 cells along the longest side, the search for the box included."""
         model = self.model
-        field, search = partial(model.logits, self._code), self._code.normalizer.invert(SEARCH_BOX)
+        field = partial(model.logits, self._code)
+        search = self._code.normalizer.invert(SEARCH_BOX)
         parts = model.names, model.colors, model.nested
         box = locate(field, search)
 
@@ -339,7 +341,8 @@ class Bench:
 
     def _grid_stage(self, name: str, ours: Callable[[], Labels], straightforward: Callable[[], Labels]) -> Stage:
         """Stage that labels a grid: its floor asks the corners of every cell that holds a change, and nothing else."""
-        labels, points = ours(), random_points(self.view, 4096)
+        labels = ours()
+        points = random_points(self.view, 4096)
         each = count_operations(lambda: self.model.logits(self._code, points)) / len(points)
         work = Work(each * int(needed_nodes(labels).sum()), float(labels.nbytes))
         return self._stage(name, work, ours, straightforward if self.rival else None, once=True)
@@ -353,7 +356,9 @@ class Bench:
         once: bool = False,
     ) -> Stage:
         """Ours and the rival's take turns, so that a busy machine slows both; with ``once`` the rival has one."""
-        mine, theirs, device = [], [], self.model.device
+        mine = []
+        theirs = []
+        device = self.model.device
         answer = other = None
         for repeat in range(self.repeats):
             spent, answer = timed(ours, device)
@@ -372,7 +377,8 @@ def _differing(ours: Any, theirs: Any) -> float | None:
     if ours is None or theirs is None or ours.shape != theirs.shape:
         return None
     if ours.dtype.kind == "f":
-        ours, theirs = ours.argmax(axis=1), theirs.argmax(axis=1)
+        ours = ours.argmax(axis=1)
+        theirs = theirs.argmax(axis=1)
     return float((ours != theirs).mean())
 
 

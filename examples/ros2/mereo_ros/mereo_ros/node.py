@@ -153,8 +153,10 @@ class ObjectTracker(Node):
         if self.stated["input"] == "depth":
             if self.info is None:
                 raise ValueError("no camera_info has come; a depth image needs it: remap camera_info")
-            frame, reading = messages.depth_frame(message, self.info, self.stated["rectified"]), {}
-        time_s, begun = messages.seconds(header), time.perf_counter()
+            frame = messages.depth_frame(message, self.info, self.stated["rectified"])
+            reading = {}
+        time_s = messages.seconds(header)
+        begun = time.perf_counter()
         if time_s < self.last_s:  # a recording that starts again
             self.tracker.forget()
         self.last_s = time_s

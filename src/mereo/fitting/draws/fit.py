@@ -144,8 +144,11 @@ def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:
 def terms(problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float) -> Terms:
     """Terms of the fit of the modes, for changes of pose and draws: the played points' ``motion`` is that of modes."""
     base, posed, config, surface = fit.base, fit.posed, fit.base.config, fit.surface
-    samples, spread, count = base.evidence.observed_samples, problem.states.played.spread, len(fit.z)
-    flat, vertices = motion.reshape(len(motion), -1), base.model.silhouette_vertices
+    samples = base.evidence.observed_samples
+    spread = problem.states.played.spread
+    count = len(fit.z)
+    flat = motion.reshape(len(motion), -1)
+    vertices = base.model.silhouette_vertices
 
     def modes_of(follow: csr_array) -> Float32[np.ndarray, "n 3 d"]:
         return (follow @ flat).reshape(-1, 3, count)
@@ -246,7 +249,8 @@ class Shape:
     @classmethod
     def of_material(cls, problem: DrawsProblem, material: Float[np.ndarray, "m 3"]) -> "Shape":
         """Shape of material points, unposed: dense and smooth."""
-        points, std = material[problem.states.played.index], 0.04 * problem.model.half
+        points = material[problem.states.played.index]
+        std = 0.04 * problem.model.half
         return cls(points, std, SHAPE_WEIGHT / (len(points) * std**2))
 
 
@@ -292,10 +296,12 @@ def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.nd
 
 def approach(states: DrawnStates, shape: Shape, state: StateOnShape) -> StateOnShape:
     """Approach the shape from a state, by one set of differences."""
-    motion, damping = derivatives(states, state.drawn, state.z, state.points), 0.1
+    motion = derivatives(states, state.drawn, state.z, state.points)
+    damping = 0.1
     for _ in range(6):
         nearer, motion, damping = _step(states, shape, state, motion, damping)
-        gain, state = state.misfit - nearer.misfit, nearer
+        gain = state.misfit - nearer.misfit
+        state = nearer
         if gain < ENOUGH * state.misfit:
             break
     return replace(state, motion=motion)
@@ -339,7 +345,8 @@ def start_near(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
 
     The states most like it approach its shape, until two of them are alike; that which explains the frame best, again.
     """
-    states, shape = problem.states, Shape.of_material(problem, problem.model.material(modes.z))
+    states = problem.states
+    shape = Shape.of_material(problem, problem.model.material(modes.z))
     guess = states.guess(modes.z, problem.model.motion)
     laid = (lay_on_shape(states, shape, start, start.z) for start in (*similar_states(problem, shape), guess))
     starts = sorted((state for state in laid if state is not None), key=by_misfit)
@@ -394,7 +401,8 @@ def similar_states(problem: DrawsProblem, shape: Shape) -> list[Drawn]:
     """Random states most like a shape."""
     states = problem.states
     some = spread(shape.points, 150)
-    library, goal = states.material[:, states.played.index], shape.points[some].astype(np.float32)
+    library = states.material[:, states.played.index]
+    goal = shape.points[some].astype(np.float32)
     cost = robust_poses(library[:, some], goal, problem.base.first_sigma)[0]
     return [states.drawn(states.seeds[row]) for row in np.argsort(cost)[: problem.config.starts]]
 
@@ -407,7 +415,9 @@ def first_sigma(problem: DrawsProblem) -> float:
 def descend(problem: DrawsProblem, fit: DrawsFit, fresh: int) -> DrawsFit:
     """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after one that is there."""
     config, least, motion = problem.config, problem.base.cloud_sigma, fit.motion
-    index, sigma, damping = problem.states.played.index, first_sigma(problem), 0.03
+    index = problem.states.played.index
+    sigma = first_sigma(problem)
+    damping = 0.03
     for number in range(fresh + (motion is not None)):
         if number or motion is None:
             motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
@@ -429,7 +439,8 @@ def lower(
     problem: DrawsProblem, fit: DrawsFit, motion: Float32[np.ndarray, "a 3 d"], sigma: float, damping: float
 ) -> tuple[DrawsFit, Float32[np.ndarray, "a 3 d"], float]:
     """Return a state of lower misfit, or the same; what was learnt of the motion; the next damping."""
-    index, least = problem.states.played.index, misfit(problem, fit, sigma)
+    index = problem.states.played.index
+    least = misfit(problem, fit, sigma)
     for _ in range(3):
         step = terms(problem, fit, motion, sigma).total.step(damping)
         tried = simulate(problem, fit.drawn, fit.z + step[POSE:], fit.posed.moved(step[:POSE]))

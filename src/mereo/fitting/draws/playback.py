@@ -189,7 +189,9 @@ class DrawnStates:
     ) -> "DrawnStates":
         """States of ``count`` seeds from ``first_seed`` on."""
         seeds = tuple(range(first_seed, first_seed + count))
-        material, calls, played = [], [], Played.of(model)
+        material = []
+        calls = []
+        played = Played.of(model)
         for seed in seeds:
             recorder = Recorder(seed, {})
             state = scene.deform(play(scene, recorder))
@@ -230,7 +232,8 @@ def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call
         ends = np.cumsum(drawn.sizes)
         normal = [(call, end) for call, end in zip(calls, ends, strict=True) if call.kind == "normal" and call.shape]
         for call, end in [(call, end) for call, end in normal if call.key[0] not in directions]:
-            numbers, row = np.arange(end - len(call.shares), end), call.shape[-1]
+            numbers = np.arange(end - len(call.shares), end)
+            row = call.shape[-1]
             parts = [part for part in numbers.reshape(-1, row) if is_direction(scene, played, drawn, part)]
             rest = np.setdiff1d(numbers, parts)
             parts += [part for part in (rest,) if is_direction(scene, played, drawn, part)]

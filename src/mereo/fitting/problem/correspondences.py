@@ -83,14 +83,17 @@ def fit_correspondences(problem: Problem, matches: Correspondences, unit: float)
     ``unit`` is the length of a scene unit of the problem in that of the correspondences. Returns the problem with them
     as its ``network``, too.
     """
-    model, target, sigma = problem.model, matches.points / unit, problem.first_sigma
+    model = problem.model
+    target = matches.points / unit
+    sigma = problem.first_sigma
     weights = model.weights(matches.rest, matches.labels)
     mean = weights(model.mean)
     scale = scale_of(matches, unit) if problem.is_scale_open else 1.0
     T = robust_rigid(scale * mean, target, matches.confidence, sigma)
     posed = Posed(T[:3, :3], T[:3, 3], np.zeros(model.count), float(np.log(scale)))
     for std in sigma * WIDE ** np.linspace(1.0, 0.0, STEPS):
-        points, motion = posed.place(weights(model.material(posed.z))), weights(model.tangent(posed.z))
+        points = posed.place(weights(model.material(posed.z)))
+        motion = weights(model.tangent(posed.z))
         offset = points - target
         weight = matches.confidence / matches.confidence.sum() * (WORTH / std**2)
         weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * std)

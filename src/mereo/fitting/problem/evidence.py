@@ -311,7 +311,8 @@ def lines_along(
     points: Float[np.ndarray, "n 3"], unknown: Float[np.ndarray, "u 3"], pitch: float | None = None
 ) -> dict[str, Any]:
     """What ``Evidence`` says of the lines of sight to points, and along ``unknown`` ones, of which nothing is known."""
-    ranges, sight = np.linalg.norm(points, axis=1), cKDTree(unit_rows(points))
+    ranges = np.linalg.norm(points, axis=1)
+    sight = cKDTree(unit_rows(points))
     angle, near = sight.query(sight.data, k=range(1, min(AROUND, len(points)) + 1))
     # the fourth neighbour of a pixel is one pitch away, as the first is; irregular clouds are not so lucky
     pitch = pitch or float(np.median(angle[:, min(4, len(points)) - 1]))
@@ -368,7 +369,8 @@ class Evidence(ObservedPoints):
         points = means_along_sight(points, most)
         unknown = lines.unknown if outliers is None else np.concatenate([outliers, lines.unknown])
         along = lines_along(points, unit_rows(unknown))
-        past, other_lines = PastLines.of(lines.past, along["pitch"]), lines.other_lines or "past"
+        past = PastLines.of(lines.past, along["pitch"])
+        other_lines = lines.other_lines or "past"
         chosen = spread(points, observed_samples)
         return cls(points, chosen, past=past, other_lines=other_lines, shared_noise=lines.shared_noise, **along)
 
@@ -420,7 +422,8 @@ class Evidence(ObservedPoints):
         std, side, pixel = noise
         slopes = self.points[:, :2] / self.points[:, 2:]
         low, high = slopes.min(axis=0) - side, slopes.max(axis=0) + side
-        number, length = np.arange(WAVES), (high - low)[:, None]
+        number = np.arange(WAVES)
+        length = (high - low)[:, None]
         waves = np.pi * number / length
         power = np.where(number == 0, 1.0, 2.0) * np.exp(-((side * waves) ** 2) / (4 * np.pi)) * side / length
         strongest = np.argsort(-np.outer(*power), axis=None, kind="stable")[:WAVES]

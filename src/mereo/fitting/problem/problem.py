@@ -202,7 +202,8 @@ class Problem:
         if len(errors.amplitudes) == 0:
             return self
         problem = self.changed(evidence=self.evidence.without(np.zeros(len(errors.amplitudes))))
-        wide, each = np.hypot(sigma, SIGMAS * self.evidence.expected_noise), len(errors.measured) * sigma**2
+        wide = np.hypot(sigma, SIGMAS * self.evidence.expected_noise)
+        each = len(errors.measured) * sigma**2
         for narrower in np.geomspace(wide, sigma, CLEARINGS):
             _, face, place = problem.met(surface)
             normal = surface.normals[face]
@@ -318,7 +319,8 @@ class Problem:
 
         The state's ``surface`` may be there already.
         """
-        samples, observed = self.samples.posed(posed), self.evidence.observed_samples
+        samples = self.samples.posed(posed)
+        observed = self.evidence.observed_samples
         directions = self.directions
         if exact:
             planes = (surface or self.surface(posed)).planes(observed, self.far, self.alike)
@@ -333,13 +335,15 @@ class Problem:
     ) -> NormalEquations:
         """Sum with the samples of a state's surface that the frame rules out."""
         few = samples.few(self.config.silhouette_vertices)
-        points, weight = few.position.astype(np.float64), self.config.silhouette_weight
+        points = few.position.astype(np.float64)
+        weight = self.config.silhouette_weight
         return add_silhouette(normal, posed, points, few.tangent, self.evidence, sigma, weight)
 
     def cloud_rows(self, posed: Posed) -> Rows:
         """Residuals of the observed samples from the faces, as the last steps of a fit have them."""
         observed, weight = self.evidence.observed_samples, self.config.cloud_weight
-        planes, errors = self.surface(posed).planes(observed, self.far, self.alike), self.evidence.sample_errors
+        planes = self.surface(posed).planes(observed, self.far, self.alike)
+        errors = self.evidence.sample_errors
         return cloud_rows(posed, observed, planes, self.cloud_sigma, weight, errors, self.directions)
 
     @property
@@ -376,7 +380,8 @@ class Problem:
     def total(self, cloud: float, silhouette: float, z: Float[np.ndarray, " k"]) -> Misfit:
         """Misfit from the mean squares of one observed sample and one silhouette vertex."""
         silhouette = silhouette * self.config.silhouette_weight * SILHOUETTE_VERTICES
-        prior, pairs = float(z @ z), PAIR_WEIGHT * self.pairs.energy(z)
+        prior = float(z @ z)
+        pairs = PAIR_WEIGHT * self.pairs.energy(z)
         shared = self.evidence.shared_errors.square
         return Misfit(cloud, self.config.cloud_weight * cloud + silhouette + prior + pairs + shared)
 
@@ -427,7 +432,8 @@ def shared_variance(offset: Float[np.ndarray, " n"], observed: ObservedPoints, f
     """
     most = 2 * ROBUST * noise_of(offset)
     offset = np.where(np.abs(offset) > ROBUST * SIGMAS * observed.largest_noise, 0.0, np.clip(offset, -most, most))
-    means, variance = offset[observed.nested], list[float]()
+    means = offset[observed.nested]
+    variance = list[float]()
     while len(means) > 1:
         first, second = means[::2], means[1::2]
         variance.append(noise_of(first - second) ** 2 / 2)

@@ -57,7 +57,8 @@ class SampledSurface:
         frames = csr_array((combine.ravel().astype(np.float32), (rows, index.ravel())), (3 * count, len(model.mean)))
         spacing = float(np.sqrt(ends[-1] / 2 / count))
         if isinstance(model, Mechanism):
-            rest, none = (frames @ model.rest_points).reshape(count, 3, 3), np.empty((count, 3, 3, 0), np.float32)
+            rest = (frames @ model.rest_points).reshape(count, 3, 3)
+            none = np.empty((count, 3, 3, 0), np.float32)
             owner = model.labels[model.faces[face, 0]].astype(np.int64) - 1
             return SampledMechanism(rest.astype(np.float32), none, spacing, owner, model)
         modes = (frames @ model.modes.reshape(len(model.modes), -1)).reshape(count, 3, 3, model.count)
@@ -220,7 +221,9 @@ class Surface:
         near = off <= far
         rows = rows[near]
         other = np.setdiff1d(np.arange(len(points)), rows)
-        distance, face, position = np.empty(len(points)), np.empty(len(points), dtype=np.int64), np.empty_like(points)
+        distance = np.empty(len(points))
+        face = np.empty(len(points), dtype=np.int64)
+        position = np.empty_like(points)
         distance[rows], face[rows], position[rows] = off[near], met[near], met_position[near]
         if len(other):
             distance[other], face[other], position[other] = self.nearest(points[other])
@@ -380,7 +383,8 @@ def are_near(model: StatisticalModel) -> bool:
     gain = 0.0
     for z in model.library[:: max(1, len(model.library) // 20)].astype(np.float64):
         prior = Prior.near(model, z, 1)
-        off, precision = z - prior.center, prior.precision
+        off = z - prior.center
+        precision = prior.precision
         gain += float(np.linalg.slogdet(precision)[1] + z @ z - off @ precision @ off)
     return gain > 0
 

@@ -55,7 +55,8 @@ def segment_poses(
     mean: Float[np.ndarray, "s c 3"], states: Float[np.ndarray, "n s c 3"]
 ) -> tuple[Float[np.ndarray, "n s 3 3"], Float[np.ndarray, "n s 3"]]:
     """Rigid motion of each segment from the mean to each state."""
-    middle, goal = mean.mean(axis=1, keepdims=True), states.mean(axis=2, keepdims=True)
+    middle = mean.mean(axis=1, keepdims=True)
+    goal = states.mean(axis=2, keepdims=True)
     rotation = best_rotations(np.matmul((mean - middle).transpose(0, 2, 1), states - goal))
     return rotation, (goal[:, :, 0] - np.matmul(rotation, middle[:, 0, :, None])[..., 0])
 
@@ -144,7 +145,8 @@ def find_segment_turns(model: StatisticalModel) -> tuple[SegmentTurns, ...]:
     """Find all such turns of an object that its states make, once for a model; none without states."""
     if model.count == 0:
         return ()
-    corners, symmetries = corners_of(model), list[SegmentTurns]()
+    corners = corners_of(model)
+    symmetries = list[SegmentTurns]()
     # from the rest pose, not from the mean, in which a part that spins is crushed
     rotation = segment_poses(model.rest_points[corners], sampled_positions(model, corners))[0]
     joints = branches(model)

@@ -194,7 +194,8 @@ class Answer:
         if self.label_points:
             with timed(seconds, "points"):
                 points = seen.seen.points
-                owner, unknown = nearest_labels(registration.solids, points), np.full(len(points), np.nan)
+                owner = nearest_labels(registration.solids, points)
+                unknown = np.full(len(points), np.nan)
                 observed = SegmentedCloud(seen.points, owner, unknown, unknown, mesh.names, mesh.colors)
                 if model is not None and seen.code is not None:
                     logits = model.logits(seen.code, points)

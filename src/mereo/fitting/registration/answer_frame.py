@@ -156,7 +156,8 @@ def search_hypotheses(seen: Observation, registrar: Registrar, keep_all: bool, s
     Takes the arguments of ``answer_frame``, and raises as it does.
     """
     unit = scene_unit_of(seen, registrar, scene_unit)
-    candidates, refusals = list[Candidate](), list[NoFit]()
+    candidates = list[Candidate]()
+    refusals = list[NoFit]()
     for reading in seen.readings(keep_all):
         try:
             candidates.append(_searched(reading, registrar, unit, seen))
@@ -211,7 +212,8 @@ def cloud_to_fit(frame: EncodedFrame, lines: SightLines, scene_unit: float | Non
     """Cloud that one hypothesis takes for the object's; ``lines`` are those around it, in the frame's axes."""
     dropped = frame.reading.whole.points[~frame.reading.keep]
     outliers = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
-    lines, seen = lines.transformed(frame.T_camera_input), frame.seen
+    lines = lines.transformed(frame.T_camera_input)
+    seen = frame.seen
     return CloudToFit(seen.points, scene_unit, outliers, lines, seen.normals)
 
 
@@ -219,7 +221,8 @@ def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float |
     """Raise ``NoFit`` for a cloud that is no view of an object of this size, where the size is known."""
     if scene_unit is None:
         return
-    seen, whole = float(np.ptp(frame.points, axis=0).max()), 2 * model.half * scene_unit
+    seen = float(np.ptp(frame.points, axis=0).max())
+    whole = 2 * model.half * scene_unit
     if SMALLEST <= seen / whole <= LARGEST:
         return
     most = main_length(frame.points)

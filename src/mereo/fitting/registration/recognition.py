@@ -64,7 +64,8 @@ class Signs:
     ) -> "Signs":
         """Signs of a registration; ``stated_scene_unit`` is the length of a scene unit as the frame's unit says it."""
         # at rest it is known, whatever was learned, and what its scene plays is one of its states
-        is_learned, z = registration.method in ("rest", "draws"), registration.modes_z
+        is_learned = registration.method in ("rest", "draws")
+        z = registration.modes_z
         return cls(
             size=None if stated_scene_unit is None else abs(float(np.log(registration.scene_unit / stated_scene_unit))),
             unexplained=(1.0 - registration.explained) / max(1.0 - registration.needed, 0.01),
@@ -152,7 +153,8 @@ def recognize(
     if registration is None:
         return NOT_EVALUATED
     signs = Signs.of(registration, stated_scene_unit, unseen)
-    known, against = known_by(signs.nats), signs.against
+    known = known_by(signs.nats)
+    against = signs.against
     recognition = Recognition(known, None, signs, has_weights)
     if known is not True or not registration.accepted:
         sign = "unexplained" if known is True else max(against, key=lambda name: against[name])

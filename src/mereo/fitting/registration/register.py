@@ -129,7 +129,8 @@ class ModesFit:
     def registration(self) -> Registration:
         """Registration of the modes, or of the rest model where the frame speaks for that."""
         if self.rest is not None:
-            problem, posed = of_rest(self.problem), self.rest.posed
+            problem = of_rest(self.problem)
+            posed = self.rest.posed
             bent = self.posed.place(self.problem.model.material(self.posed.z))
             end = ModesOptimum(problem, posed, self.unit, self.others, bent)
             return self._registration("rest", self.problem.model.rest_z, end, posed, self.surface)
@@ -172,10 +173,14 @@ class ModesFit:
     ) -> Registration:
         distance = self.problem.nearest(surface)[0]
         explained = float((distance <= self.tolerance).mean())
-        model, drawn, factors = self.problem.model, None, RadiusFactors()
+        model = self.problem.model
+        drawn = None
+        factors = RadiusFactors()
         if isinstance(model, Mechanism):  # whose numbers are the scene's draws
-            method, z = "draws", model.draws(z)
-            drawn, model = Drawn(STATES_SEED, z, model.sizes, np.ones(len(z), dtype=bool)), model.registered
+            method = "draws"
+            z = model.draws(z)
+            drawn = Drawn(STATES_SEED, z, model.sizes, np.ones(len(z), dtype=bool))
+            model = model.registered
         if self.calibration is not None:
             factors = self.calibration.radii(draws=method == "draws", noisy=self.problem.is_noisy)
         misfit = 0.0 if factors.misfit is None else self.problem.cloud_misfit(surface)

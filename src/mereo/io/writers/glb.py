@@ -51,7 +51,8 @@ def write_segments_glb(
 
     Raises ``ValueError`` where no segment has faces.
     """
-    solid, arrays = with_faces(surfaces), _Arrays()
+    solid = with_faces(surfaces)
+    arrays = _Arrays()
     matrix = np.eye(4)
     matrix[:3, :3] = np.asarray(frame_rotation) * unit_m
     root = {"name": VIEWER_ROOT, "matrix": matrix.T.ravel().tolist(), "children": list(range(1, len(solid) + 1))}
@@ -113,10 +114,12 @@ class _Arrays:
         is_faces = values.dtype.kind == "i"
         component, target = (5125, 34963) if is_faces else (5126, 34962)
         array = values.astype("<u4" if is_faces else "<f4")
-        start, number = sum(len(chunk) for chunk in self.chunks), len(self.accessors)
+        start = sum(len(chunk) for chunk in self.chunks)
+        number = len(self.accessors)
         self.chunks.append(array.tobytes())
         self.views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
-        low, high = array.min(axis=0).tolist(), array.max(axis=0).tolist()
+        low = array.min(axis=0).tolist()
+        high = array.max(axis=0).tolist()
         head = {"bufferView": number, "componentType": component, "count": len(array), "type": kind}
         self.accessors.append({**head, "min": low, "max": high})
         return number

@@ -74,7 +74,8 @@ def prepare(cloud: np.ndarray, settings: dict) -> tuple:
         raise ValueError(f"the cloud has {len(points)} points; the encoder needs at least {fewest}: move closer")
     if (points[:, 2] <= 0).any():
         raise ValueError("points have z <= 0, behind the camera; the cloud must be x right, y down, z forward: turn it")
-    low, high = points.min(axis=0), points.max(axis=0)
+    low = points.min(axis=0)
+    high = points.max(axis=0)
     half = float((high - low).max()) / 2
     if not half > 0:
         raise ValueError("all points coincide; the cloud needs an extent: check the file's columns and units")

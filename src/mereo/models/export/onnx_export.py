@@ -127,7 +127,8 @@ def export_graphs(model: Model) -> Graphs:
             "train with --network.encoder pointnet2 or point-transformer to export"
         )
     cloud = _example_points(config.points)
-    encoder, query = EncoderGraph(model.network).eval(), QueryGraph(model).eval()
+    encoder = EncoderGraph(model.network).eval()
+    query = QueryGraph(model).eval()
     with torch.no_grad(), _quiet():
         traced = torch.export.export(encoder, (cloud,), dynamic_shapes=({1: Open},), strict=False)
         code = encoder(cloud)
@@ -237,7 +238,8 @@ def trilinear(volume: Tensor, grid: Tensor, interpolation_mode: int, padding_mod
     values = volume.reshape(channels, -1)
     total = torch.zeros_like(axes[0][1])
     for corner in product((0, 1), repeat=3):
-        index, weight = torch.zeros_like(axes[0][0]), torch.ones_like(total)
+        index = torch.zeros_like(axes[0][0])
+        weight = torch.ones_like(total)
         for (low, part), step, size in zip(axes, corner, sizes, strict=True):
             index = index * size + low + step
             weight = weight * (part if step else 1 - part)

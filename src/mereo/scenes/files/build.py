@@ -121,7 +121,8 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
             f"least, as the camera's noise is 0.1: raise it to {file.size * SMALLEST / longest:.3g} or more",
         )
     rest = mesh.with_vertices([placement.apply(segment.vertices) for segment in mesh.segments])
-    nearest, radius = file.camera.distance[0], float(norm(np.ptp(rest.bounds, axis=0))) / 2
+    nearest = file.camera.distance[0]
+    radius = float(norm(np.ptp(rest.bounds, axis=0))) / 2
     if not nearest > radius:
         raise document.error(
             ("camera", "distance"),
@@ -129,7 +130,8 @@ def build(document: Document, file: SceneFile, mesh: SegmentedMesh) -> Scene:
             "scene units from its centre: start farther away, or lower `size`",
         )
     workspace = file.camera.workspace()
-    unit_m, definition = file.units / placement.scale, file.model_dump_json(exclude=SOURCES)
+    unit_m = file.units / placement.scale
+    definition = file.model_dump_json(exclude=SOURCES)
     if file.states is not None:
         scene = _recorded(document, file, rest, placement, workspace)
         definition += _digest(files_of_states(*_paths_of_states(document.path, file)))
@@ -238,7 +240,8 @@ def _random_motion(
     document: Document, placement: Normalizer, rest: SegmentedMesh, blocks: Sequence[AnyDeformation]
 ) -> RandomMotion:
     """All deformations of the file in their order."""
-    steps, names = [], list(rest.names)
+    steps = []
+    names = list(rest.names)
     _check_joints(document, blocks)
     for index, block in enumerate(blocks):
         for name in block.segments or ():

@@ -102,7 +102,8 @@ def _report(mesh: SegmentedMesh, health: list[Health], unit: str, is_mechanism: 
 
     Overlaps are none of a mechanism, whose links are often made of shells that overlap, too, such as a motor's.
     """
-    faults, usable = 0, not any(condition.hopeless for condition in health)
+    faults = 0
+    usable = not any(condition.hopeless for condition in health)
     volumes = mesh.owned_volumes if usable else [np.nan] * len(health)
     for segment, condition, volume in zip(mesh.segments, health, volumes, strict=True):
         inside = volume if condition.sound or condition.hopeless else grid_volume(replace(segment, solid=False))
@@ -117,7 +118,8 @@ def _report(mesh: SegmentedMesh, health: list[Health], unit: str, is_mechanism: 
         if not condition.mendable:
             print(f"  cure: no repair makes a solid of it; export {segment.name} again as a closed surface")
     if usable:
-        shared, count = overlaps(_marked(mesh, health)), len(health)
+        shared = overlaps(_marked(mesh, health))
+        count = len(health)
         faults += 0 if is_mechanism else len(shared)
         for overlap in shared:
             print(f"  {'note' if is_mechanism else 'fault'}: {overlap}")
@@ -143,7 +145,8 @@ def _check_repaired(
 ) -> None:
     """Repair, say what was changed, write it, and check what was written."""
     fixed = [repaired(segment, unit) for segment in mesh.segments]
-    whole, cuts = replace(mesh, segments=tuple(fix.segment for fix in fixed)), dict[str, list[str]]()
+    whole = replace(mesh, segments=tuple(fix.segment for fix in fixed))
+    cuts = dict[str, list[str]]()
     if not is_mechanism:
         whole, cuts = without_overlaps(whole)
     changed = set[str]()
@@ -223,7 +226,8 @@ def _with_segment_files(document: Document, mesh: SegmentedMesh, changed: set[st
     Where the segments were parts of a model or labels of a volume, all get a file of their own: one scene file takes
     its segments from one kind of source.
     """
-    kept, outer = "segments" in document.data, dict(mesh.nested)
+    kept = "segments" in document.data
+    outer = dict(mesh.nested)
     frames = link_frames(document, read(document))
     files = {name: re.sub(r"[^\w.-]+", "_", name) + "-repaired.ply" for name in (changed if kept else mesh.names)}
     if kept:
@@ -278,7 +282,8 @@ def _report_states(scene: Scene) -> int:
             if pair not in at_rest:
                 worst[pair] = max(worst.get(pair, overlap), overlap, key=lambda each: each.share)
         views.append(_view(scene.workspace, mesh, rng))
-    seen, middle = min(share for share, _ in views), np.median([count for _, count in views])
+    seen = min(share for share, _ in views)
+    middle = np.median([count for _, count in views])
     print(f"picture: a typical view shows it in {middle:.0f} of {WIDTH**2:,} pixels ({middle / WIDTH**2:.1%})")
     is_mechanism = _is_mechanism(scene)
     for overlap in worst.values():

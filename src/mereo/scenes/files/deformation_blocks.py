@@ -213,7 +213,9 @@ class BendBlock(DeformationBlock):
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of bends; ``Misfit`` where ``toward`` is along the axis, or the largest one would fold space over."""
-        origin, axis, length = target.point(self.origin), np.array(self.axis), self.length * target.unit
+        origin = target.point(self.origin)
+        axis = np.array(self.axis)
+        length = self.length * target.unit
         toward = None if self.toward is None else np.array(self.toward)
         if toward is not None and norm(np.cross(toward, axis)) < 1e-9 * norm(toward):
             raise Misfit("toward", f"`toward` is {list(self.toward or ())}, along the axis; it must point away from it")
@@ -314,7 +316,8 @@ class JointBlock(DeformationBlock):
 
     def sampler(self, target: Target) -> DeformationSampler:
         """Sampler of rigid motions about the pivot, in scene units and radians."""
-        slide, shift = _lengths(self.slide, target), np.array(self.shift) * target.unit
+        slide = _lengths(self.slide, target)
+        shift = np.array(self.shift) * target.unit
         axis = np.array(self.axis)
         names = self.name or "", self.follows or ""
         return samplers.JointSampler(target.point(self.pivot), axis, _radians(self.angle), slide, shift, *names)
@@ -428,7 +431,8 @@ MOST_LATTICE, MOST_TETRAHEDRA = 100_000, 200_000
 """Tetrahedra of a lattice, and of a volume mesh from a file: 160,000 of a liver take 146 s and 2.9 GB to find 100
 modes, on two busy cores; 55,000 of a cube half as much, as more of them are neighbours."""
 
-CELLS, FULL = (16, 24, 32, 48), 0.6
+CELLS = (16, 24, 32, 48)
+FULL = 0.6
 """Cells along the longest side of an elastic solid, and how full one is on average of those that hold material."""
 
 
@@ -502,13 +506,15 @@ class ElasticBlock(DeformationBlock):
 
         ``Misfit`` for unknown segments, for places that hold nothing, and for segments that are not in one piece.
         """
-        names, bounds = list(target.moved.names), target.moved.bounds
+        names = list(target.moved.names)
+        bounds = target.moved.bounds
         for name in self.stiffness:
             if name not in names:
                 raise Misfit("stiffness", f"no segment is called {name!r}: {similar(name, names)}")
         stiffness = [self.stiffness.get(name, 1.0) for name in names] if self.stiffness else None
         if self.tetrahedra is None:
-            solid, numbers = self.lattice(target.moved, stiffness), None
+            solid = self.lattice(target.moved, stiffness)
+            numbers = None
         else:
             solid, numbers = self._volume(target, stiffness)
         if (pieces := solid.pieces) > 1:

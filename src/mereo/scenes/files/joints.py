@@ -28,7 +28,8 @@ from mereo.geometry.transforms import Flags, Indices, Points, Values, Vector, lo
 # taken out of it first, as clusters of one normal and offset. What is left is a cylinder where its normals are all
 # across one axis, and then centre and radius are linear in points p and normals n: ``p - radius n = center``.
 
-CLEARANCE, AGAINST = 0.005, -0.8
+CLEARANCE = 0.005
+AGAINST = -0.8
 """Largest gap that counts as contact, in longest sides of the object, for fits have some; largest cosine of normals."""
 
 POINTS, LEAST_POINTS = 1500, 12
@@ -101,7 +102,8 @@ def _touching(first: Segment, second: Segment, reach: float) -> tuple[Points, Po
         return np.empty((0, 3)), np.empty((0, 3))
     points, face = surface_points(first.vertices, first.faces, POINTS)
     near = ((points >= low) & (points <= high)).all(axis=1)
-    points, normals = points[near], _normals(first, face[near])
+    points = points[near]
+    normals = _normals(first, face[near])
     if len(points) == 0:
         return points, normals
     gap, opposite = _distance(points, second)
@@ -111,7 +113,8 @@ def _touching(first: Segment, second: Segment, reach: float) -> tuple[Points, Po
 
 def _shapes(first: int, second: int, points: Points, normals: Points, reach: float) -> list[Contact]:
     """Planes of a contact, largest first, and what is left of it."""
-    touching, count = [], len(points)
+    touching = []
+    count = len(points)
     while len(points) >= LEAST_POINTS:
         flat = _largest_plane(points, normals, reach)
         if flat.sum() < max(PLANE_SHARE * count, LEAST_POINTS):
@@ -152,7 +155,8 @@ def _cylinder(first: int, second: int, points: Points, normals: Points) -> Conta
     system[0::2, 0] = system[1::2, 1] = 1.0
     system[:, 2] = outward.ravel()
     solution = lstsq(system, flat.ravel(), rcond=None)[0]
-    center, radius = solution[:2], abs(float(solution[2]))
+    center = solution[:2]
+    radius = abs(float(solution[2]))
     misfit = norm(flat - center, axis=1) - radius
     if not np.sqrt(np.mean(misfit**2)) < MISFIT * radius:
         return None
@@ -357,7 +361,9 @@ def _narrowed(test: _CollisionTest, joints: Sequence[Joint]) -> tuple[Joint, ...
     faces = sum(len(segment.faces) for segment in test.mesh.segments)
     shares = _combinations(len(joints), int(np.clip(MOST_MOVED // (faces * len(joints)), STATES // 8, STATES)))
     alone = np.array([joint.alone for joint in joints])
-    ranges, tries, clean = alone.copy(), 0, False
+    ranges = alone.copy()
+    tries = 0
+    clean = False
     while not clean:
         clean = True
         for share in shares:

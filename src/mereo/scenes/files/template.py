@@ -140,7 +140,8 @@ def _blocks(mesh: SegmentedMesh, strength: float) -> Blocks:
     radius = distance_from_line(mesh.merged()[0], origin, axis)
     most = min(BEND_SHARE * np.rad2deg(length / radius), MOST_BEND_DEG)
     (x, y, z), (u, v, w) = (rounded(value) for value in origin), axis.tolist()
-    angle, size = float(np.floor(most * strength)), rounded(length)
+    angle = float(np.floor(most * strength))
+    size = rounded(length)
     share = rounded(MOST_STRENGTH * strength, 2)
     bend = BendBlock(type="bend", origin=(x, y, z), axis=(u, v, w), length=size, angle=(-angle, angle))
     return (bend, *(LATTICES * [LatticeBlock(type="lattice", spacing=rounded(length / 2), strength=share)]))
@@ -254,7 +255,9 @@ def _base(solid: trimesh.Trimesh, hull: trimesh.Trimesh, normal: Vector) -> Flat
 
 # --- the camera -------------------------------------------------------------------------------------------------------
 
-NEAR, FARTHER, MOST_VIEW_RAD = 100.0, 1.25, radians(40.0)
+NEAR = 100.0
+FARTHER = 1.25
+MOST_VIEW_RAD = radians(40.0)
 """Nearest distance of the camera in scene units, as in the paper, or as far as the object fills no wider view; and the
 farthest in nearest ones. Twice, as in the paper, leaves a quarter of the picture's pixels."""
 
@@ -493,7 +496,8 @@ def _surfaces(
 
 def _likely_frame(file: Path, bounds: Corners) -> tuple[str, str, int, str]:
     """Unit of a mesh file, and why; the axis that points upwards in it, and why."""
-    kind, guess = file.suffix.lower().lstrip("."), likely_unit(bounds)
+    kind = file.suffix.lower().lstrip(".")
+    guess = likely_unit(bounds)
     longest_m = longest_side(bounds) * UNITS_M[guess]
     robots = dict.fromkeys((suffix[1:] for suffix in ROBOT_SUFFIXES), ("m", "the rule of robots' files"))
     known = robots | {
@@ -512,20 +516,23 @@ def _likely_frame(file: Path, bounds: Corners) -> tuple[str, str, int, str]:
 
 def _draft(name: str, source: _Source, meshes: MeshesConfig, aperture: float) -> tuple[str, list[str]]:
     """Text of a scene file, and sentences about what it proposes."""
-    sides, way = np.ptp(source.mesh.bounds, axis=0), meshes.deformations
+    sides = np.ptp(source.mesh.bounds, axis=0)
+    way = meshes.deformations
     size = rounded(min(SIZE, LONGEST * float(sides.min() / sides.max())), 3)
     placement = placed(source.mesh, size)
     robot = [_robot_block(joint) for joint in source.robot or ()]
     joints = proposed_joints(source.mesh) if source.assembly and source.robot is None else ()
     if source.robot is not None and way in ("auto", "articulated", "rigid"):  # its links are rigid
-        way, why = ("articulated" if robot else "rigid"), "as the file says"
+        way = "articulated" if robot else "rigid"
+        why = "as the file says"
     else:
         way, why = _chosen(way, joints)
     motion = {"soft": SOFT, "stiff": STIFF}.get(way)
     moves = _Moves(way, joints, () if motion is None else default_deformations(source.mesh, motion), robot)
     rest = source.mesh.with_vertices([placement.apply(segment.vertices) for segment in source.mesh.segments])
     x, y, z = np.eye(3)[source.up].tolist()
-    up_reason, base = source.up_reason, flat_base(source.mesh, (x, y, z)) if source.assembly else None
+    up_reason = source.up_reason
+    base = flat_base(source.mesh, (x, y, z)) if source.assembly else None
     if base is not None:
         up_reason, (x, y, z) = "it stands on its flat base", [rounded(value, 3) for value in -base.normal]
     workspace = Workspace(radians(aperture), axis=(x, y, z), any_roll=aperture == 360.0)
@@ -633,7 +640,9 @@ def _narrowed(joint: Joint) -> str:
 def _deformations(mesh: SegmentedMesh, moves: _Moves) -> str:
     """The key ``deformations`` with its lines: joints, what bends the whole, and others in comments."""
     (start, longest, length), joints = _longest_side(mesh), _joints(mesh, moves.joints)
-    end, axis, shortest = _numbers(start), np.eye(3, dtype=int)[longest].tolist(), np.ptp(mesh.bounds, axis=0).min()
+    end = _numbers(start)
+    axis = np.eye(3, dtype=int)[longest].tolist()
+    shortest = np.ptp(mesh.bounds, axis=0).min()
     further = FURTHER.format(end=end, axis=axis, length=rounded(length), push=0.1 * shortest, reach=0.5 * shortest)
     if moves.way == "rigid":
         return f"deformations: rigid\n{joints}{further}"
@@ -648,7 +657,8 @@ def _deformations(mesh: SegmentedMesh, moves: _Moves) -> str:
 def _soft(mesh: SegmentedMesh, blocks: Blocks) -> str:
     """Lines of what bends the whole object."""
     if isinstance(blocks[0], ElasticBlock):
-        vertices, longest = mesh.merged()[0], int(np.ptp(mesh.bounds, axis=0).argmax())
+        vertices = mesh.merged()[0]
+        longest = int(np.ptp(mesh.bounds, axis=0).argmax())
         return ELASTIC_TEXT.format(
             motion=blocks[0].motion,
             soft=SOFT,
@@ -659,7 +669,8 @@ def _soft(mesh: SegmentedMesh, blocks: Blocks) -> str:
         )
     bend, lattice = blocks[0], blocks[-1]
     assert isinstance(bend, BendBlock) and isinstance(lattice, LatticeBlock)
-    end, axis = _numbers(np.array(bend.origin)), [int(value) for value in bend.axis]
+    end = _numbers(np.array(bend.origin))
+    axis = [int(value) for value in bend.axis]
     return RUBBER.format(lattice=lattice, end=end, axis=axis, length=bend.length, angle=bend.angle[1])
 
 
