@@ -752,8 +752,10 @@ class Trail:
     @property
     def is_evident(self) -> bool:
         """Whether that explains a clean frame, and no other hypothesis may win as much as the frame rules out of it."""
-        ruled_out = self.problem.silhouette_misfit(self.best.surface)
-        return self.is_explained and not self.problem.is_noisy and ruled_out + self.handicap < WHOLE
+        problem = self.problem
+        best = self.best
+        is_explained = best.misfit.cloud < FitConfig.explained and not problem.is_noisy
+        return is_explained and problem.silhouette_misfit(best.surface) + self.handicap < WHOLE
 
     def go_on(self, stage: SearchRound, poses: list[Posed]) -> None:
         """Fit the candidates of a round that may be the best."""
