@@ -166,14 +166,14 @@ def test_a_secant_agrees_with_the_step_and_only_there() -> None:
 
 
 def test_the_approach_reaches_a_state_of_the_scene(model: StatisticalModel, states: DrawnStates) -> None:
-    points = states.material[7][states.played.index].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
+    points = states.places[7].astype(np.float64) @ np.diag([-1.0, -1.0, 1.0]) + 5.0
     shape = Shape(points, 0.04 * model.half, 1.0)
     drawn = Drawn.of(SCENE, states.seeds[3])
     start = lay_on_shape(states, shape, drawn, drawn.z)
     near = start
     for _ in range(3):
         near = approach(states, shape, near)
-    apart = [norm(n.points @ n.rotation.T + n.translation - points, axis=1) for n in (start, near)]
+    apart = [norm(n.placed - points, axis=1) for n in (start, near)]
     assert near.misfit < start.misfit
     assert np.median(apart[1]) < 0.3 * np.median(apart[0])
 

@@ -203,7 +203,10 @@ def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
 
 
 def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:
-    return simulate(problem, Drawn.of(scene(), 1000), z, POSE)
+    fit = simulate(problem, Drawn.of(scene(), 1000), z, POSE)
+    assert fit is not None
+    motion = states().derivatives(fit.drawn, fit.z, fit.material[states().played.index])
+    return replace(fit, motion=motion)
 
 
 TRUTH = np.array([0.3, 0.9, -0.5])

@@ -7,6 +7,7 @@ import pytest
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
+from scipy.stats import norm as norm_of
 from toy_scene import rest_mesh
 
 from mereo.deformation.draw_names import named
@@ -47,6 +48,45 @@ def test_what_is_a_direction_is_seen_by_what_its_length_moves() -> None:
     assert_allclose(drawn.z[-3:], plain.z[-3:])
     before, after = (states.played.moved(plain.deformations(scene, z) or ()) for z in (plain.z, drawn.z))
     assert_allclose(after, before, atol=1e-6)
+
+
+REFUSED = 2.0 * norm_of.cdf(1e-3 - 0.02) - 1.0
+"""Amount one step of differences beside that of 1e-3 standard deviations."""
+
+
+def sample_apart(rng: Generator) -> tuple[Deformation, ...]:
+    """Moves of all segments together and of each alone, which the last one may not do by one amount."""
+    whole = rng.normal(size=3)
+    alone = rng.uniform(-1.0, 1.0, size=(4, 3))
+    if abs(alone[3, 2] - REFUSED) < 1e-4:
+        raise ValueError("refused")
+    return tuple(Moved(whole + each) for each in alone)
+
+
+@pytest.mark.parametrize(("last", "plays"), [(1.0, 1 + 3 + 3), (1e-3, 1 + 3 + 3 + 4)])
+def test_draws_of_different_segments_are_played_at_once(
+    last: float, plays: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = Scene("apart", rest_mesh(), sample_apart, Workspace())
+    states = DrawnStates.of(scene, scene_model(scene, 30, 1000), 4, 1000)
+    drawn = states.drawn(1000)
+    assert states.reach[drawn.sizes].sum(axis=0).tolist() == [4] * 3 + [1] * 12
+    z = np.append(drawn.z[:-1], last)
+    positions = states.played.moved(drawn.deformations(scene, z) or ())
+    played = []
+    deformations = Drawn.deformations
+    monkeypatch.setattr(
+        Drawn, "deformations", lambda *state, **how: played.append(state) or deformations(*state, **how)
+    )
+    motion = states.derivatives(drawn, z, positions)
+    owner = np.repeat(np.arange(4), states.played.counts)
+    expected = np.zeros((len(owner), 3, 15))
+    expected[:, range(3), range(3)] = 1.0
+    for number in range(12):
+        expected[owner == number // 3, number % 3, 3 + number] = 2.0 * norm_of.pdf(z[3 + number])
+    expected[:, 2, -1] *= plays == 7  # a step that is refused says nothing
+    assert_allclose(motion, expected, atol=0.02)
+    assert len(played) == plays, "this state, three together, the twelve in threes, and one of these again"
 
 
 REFUSES = {"human": 7, "robot": 3, "rope": 1, "sheet": 5}

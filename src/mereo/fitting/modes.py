@@ -8,6 +8,7 @@
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from operator import attrgetter
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -39,6 +40,7 @@ HOPELESS = 4.0
 most else 4.3 to 6."""
 
 
+@lru_cache(maxsize=4)  # a search may come back to fits around which it has found nothing better
 def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
     """Fit again from states around the best, drawn from the prior's spread, as long as one of them is better.
 
@@ -53,8 +55,9 @@ def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
         before = best
         z = best.posed.z
         starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
-        for _, posed in bend_by_few(problem, starts, 3)[:3]:
-            best = min(best, refined(problem, fit_wide(problem, posed)), key=lambda scored: scored.misfit.total)
+        wide = [ScoredFit.of(problem, fit_wide(problem, posed)) for _, posed in bend_by_few(problem, starts, 3)[:3]]
+        nearest = min(wide, key=total_misfit)
+        best = min(best, nearest.better(problem, refine(problem, nearest.posed)), key=total_misfit)
         if best is before:
             break
     return best
@@ -114,6 +117,9 @@ class ScoredFit:
         """Return this fit, or another state where its misfit is lower."""
         scored = ScoredFit.of(problem, other)
         return scored if scored.misfit.total < self.misfit.total else self
+
+
+total_misfit = attrgetter("misfit.total")
 
 
 def fit_wide(problem: Problem, posed: Posed) -> Posed:
@@ -234,5 +240,5 @@ def lowered(problem: Problem, posed: Posed) -> ScoredFit:
             normal = best.problem.seen(known, best.posed, problem.cloud_sigma, True, best.surface)
             other = ScoredFit.of(problem, best.posed.moved(normal.step(damping)))
             gain = best.misfit.total - other.misfit.total
-            best = min(best, other, key=lambda fit: fit.misfit.total)
+            best = min(best, other, key=total_misfit)
     return best

@@ -18,7 +18,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import cycle, permutations
-from operator import attrgetter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +39,7 @@ from mereo.fitting.modes import (
     robust_poses,
     settled_once,
     shaken,
+    total_misfit,
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
@@ -491,7 +491,8 @@ class Screen:
     def starts(self, rotations: Float[np.ndarray, "r 3 3"]) -> Poses:
         """Every state at every rotation, its visible side on the cloud; where ``scaled``, as large as the cloud.
 
-        Where something may hide a part of the object, also the halves of its visible side in each direction.
+        Where something may hide a part of the object, also one of the halves of its visible side, at each rotation the
+        next one.
         """
         rotations = rotations.astype(np.float32)
         center = self.points.mean(axis=0)
@@ -499,10 +500,13 @@ class Screen:
         parts = [visible]
         if self.in_part:
             total = np.maximum(visible.sum(axis=1, keepdims=True), 1e-9)
+            halves = []
             for axis in self.sight.axes(center):
                 across = self.tables.position @ (rotations.transpose(0, 2, 1) @ axis).T
                 middle = (across * visible).sum(axis=1, keepdims=True) / total
-                parts += [np.where(across > middle, visible, 0.0), np.where(across <= middle, visible, 0.0)]
+                halves += [np.where(across > middle, visible, 0.0), np.where(across <= middle, visible, 0.0)]
+            turn = np.arange(len(rotations))
+            parts += [np.stack(halves)[turn % len(halves), :, :, turn].transpose(1, 2, 0)]
         return Poses.of_all([self._on_cloud(part, rotations) for part in parts])
 
     def _on_cloud(
@@ -530,11 +534,11 @@ class Screen:
 
     def best(self, poses: Poses, count: int) -> Poses:
         """Poses that the frame has drawn to it, by rigid steps and those of joints: the best that differ."""
-        for sigma, share in SIGMAS:
+        for sigma in SIGMAS:
             poses = self.scored(poses, sigma, moves=True)
-            kept = max(round(share * len(poses)), 2 * count)
+            kept = max(round(GO_ON * len(poses)), 2 * count)
             poses = poses.rows(np.argsort(poses.cost)[:kept])
-        return self.differing(self.scored(poses, SIGMAS[-1][0]), count)
+        return self.differing(self.scored(poses, SIGMAS[-1]), count)
 
     def differing(self, poses: Poses, count: int) -> Poses:
         """The best poses that differ, so many of them."""
@@ -678,11 +682,11 @@ MECHANISM_ROUNDS = (
 )
 """Those of a mechanism (docs/experiments.md, entry 96)."""
 
-SIGMAS = (
-    *((0.15, 1.0), (0.15, 0.7), (0.12, 0.6), (0.1, 0.6), (0.08, 0.6), (0.06, 0.7)),
-    *((0.05, 1.0), (0.05, 1.0), (0.05, 1.0)),
-)
-"""The cloud's standard deviation in each rigid step, in half lengths, and which share of the poses go on after it."""
+SIGMAS = np.geomspace(0.15, 0.05, 9)
+"""The cloud's standard deviation in each rigid step, in half lengths."""
+
+GO_ON = 0.65
+"""Share of the poses that go on after each of these."""
 
 RIVAL = 1.5
 """Misfit by few points, in misfits of the best, up to which a candidate may still be as good."""
@@ -719,9 +723,6 @@ def rotations(count: int) -> Float[np.ndarray, "n 3 3"]:
     return Rotation.from_quat(np.stack(spiral, axis=1)).as_matrix()
 
 
-_total = attrgetter("misfit.total")
-
-
 @dataclass(eq=False)
 class Trail:
     """Search under one hypothesis on the lines of sight around the cloud, by the constants of one noise.
@@ -739,7 +740,7 @@ class Trail:
     @property
     def best(self) -> ScoredFit:
         """The state of the least misfit."""
-        return min(self.fitted, key=_total)
+        return min(self.fitted, key=total_misfit)
 
     @property
     def is_explained(self) -> bool:
@@ -762,7 +763,7 @@ class Trail:
         ranked = bend_by_few(self.problem, poses, stage.fitted)
         fitted = list[ScoredFit]()
         for cost, posed in ranked[: stage.fitted]:
-            if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=_total).explains(self.problem):
+            if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=total_misfit).explains(self.problem):
                 break
             fitted.append(refined(self.problem, fit_wide(self.problem, posed)))
         self.fitted += fitted
@@ -772,7 +773,7 @@ class Trail:
 
     def shake(self) -> None:
         """Fit again from states around the best fits that differ: an object that looks alike turned is one of them."""
-        ranked = sorted(self.fitted, key=_total)
+        ranked = sorted(self.fitted, key=total_misfit)
         for row in differing(self.problem, [scored.posed for scored in ranked], APART)[:SHAKEN_FITS]:
             if self.is_explained:
                 return
@@ -792,7 +793,7 @@ class Trail:
 
     def in_problem(self, problem: Problem) -> "Trail":
         """The same from its best states that differ, in another problem of the frame."""
-        states = [scored.posed for scored in sorted(self.fitted, key=_total)]
+        states = [scored.posed for scored in sorted(self.fitted, key=total_misfit)]
         rows = differing(problem, states, BENT_APART)[:KEPT]
         fits = [refined(problem, fit_wide(problem, states[row])) for row in rows]
         return Trail(problem, self.handicap, fits, self.is_repeated)
@@ -821,7 +822,9 @@ class Trail:
         That a whole, or a segment, looks the same turned is said by its symmetry.
         """
         model, best = self.problem.model, self.best
-        rivals = sorted((fit for fit in self.fitted if _total(fit) <= ALIKE * _total(best)), key=_total)
+        rivals = sorted(
+            (fit for fit in self.fitted if total_misfit(fit) <= ALIKE * total_misfit(best)), key=total_misfit
+        )
         rows = differing(self.problem, [fit.posed for fit in rivals], APART)[1:]
         others = [rivals[row].surface.material for row in rows]
         vertices = model.silhouette_vertices

@@ -7,7 +7,7 @@ modes, with the same residuals. The scene is played with the draws that fit best
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Float, Float32, Int
 from scipy.sparse import csr_array
 
 from mereo.deformation.moving_least_squares import PointWeights, spread
@@ -17,6 +17,7 @@ from mereo.fitting.draws.playback import (
     DrawnStates,
     as_sparse,
     material_moved,
+    unmoving,
 )
 from mereo.fitting.modes import robust_poses
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, geman_mcclure, in_space
@@ -96,18 +97,12 @@ class DrawsFit:
 
 
 def simulate(problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed) -> DrawsFit | None:
-    """Simulate the state of these draws and score it; None where the scene refuses it."""
+    """Simulate the state of these draws and score it; None where the scene refuses it or no face of it is seen."""
     z = drawn.normalized(z)
     deformations = drawn.deformations(problem.states.scene, z)
     if deformations is None:
         return None
-    return score_material(problem, drawn, z, posed, material_moved(problem.states.scene, problem.model, deformations))
-
-
-def score_material(
-    problem: DrawsProblem, drawn: Drawn, z: Float[np.ndarray, " d"], posed: Posed, material: Float[np.ndarray, "m 3"]
-) -> DrawsFit | None:
-    """Score material points as those of a state; None where no face of them is seen."""
+    material = material_moved(problem.states.scene, problem.model, deformations)
     rigid = replace(posed, z=np.empty(0))
     surface = Surface.through(problem.model, rigid.place(material), problem.base.evidence.shows)
     if len(surface.facing) == 0:
@@ -176,11 +171,6 @@ HELD = 1e6
 """Precision of draws that move nothing at a state: they stay."""
 
 
-def unmoving(motion: Float32[np.ndarray, "a 3 d"]) -> Bool[np.ndarray, " d"]:
-    """Mark the draws that move nothing."""
-    return np.asarray(np.abs(motion).max(axis=(0, 1)) < 1e-9)  # scene units
-
-
 def prior_of_draws(
     z: Float[np.ndarray, " d"], motion: Float32[np.ndarray, "a 3 d"], log_scale: float, scale_std: float
 ) -> NormalEquations:
@@ -188,29 +178,6 @@ def prior_of_draws(
     still = unmoving(motion)
     precision = np.diag(np.where(still, HELD, 1.0))
     return NormalEquations.prior(np.where(still, 0.0, z), np.zeros(len(z)), precision, log_scale, scale_std)
-
-
-def derivatives(
-    states: DrawnStates, drawn: Drawn, z: Float[np.ndarray, " d"], positions: Float[np.ndarray, "a 3"]
-) -> Float32[np.ndarray, "a 3 d"]:
-    """Motion of the played points, which are ``positions``, for a standard deviation of each draw.
-
-    Neighbours are played without the scene's own test where this state is the same without it: it is not where a scene
-    refuses and draws again in a way that ``Drawn`` does not see through.
-    """
-    change = np.zeros((*positions.shape, len(z)), dtype=np.float32)
-    untested = drawn.deformations(states.scene, z, checked=False)
-    checked = (
-        untested is None or float(np.abs(states.played.moved(untested) - positions).max()) > 1e-4
-    )  # rest points are in single precision
-    for number in np.flatnonzero(drawn.smooth):
-        step = 0.02 * (-1.0 if z[number] > 0 else 1.0)
-        other = z.copy()
-        other[number] += step
-        moved = drawn.deformations(states.scene, other, checked)
-        if moved is not None:
-            change[:, :, number] = (states.played.moved(moved) - positions) / step
-    return change
 
 
 def secant(
@@ -273,6 +240,11 @@ class StateOnShape:
     misfit: float
     motion: Float32[np.ndarray, "a 3 d"] | None = None
 
+    @property
+    def placed(self) -> Float[np.ndarray, "a 3"]:
+        """The points on the shape."""
+        return self.points @ self.rotation.T + self.translation
+
 
 def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.ndarray, " d"]) -> StateOnShape | None:
     """Lay the state of these draws robustly onto the shape; None where the scene refuses it."""
@@ -296,7 +268,7 @@ def lay_on_shape(states: DrawnStates, shape: Shape, drawn: Drawn, z: Float[np.nd
 
 def approach(states: DrawnStates, shape: Shape, state: StateOnShape) -> StateOnShape:
     """Approach the shape from a state, by one set of differences."""
-    motion = derivatives(states, state.drawn, state.z, state.points)
+    motion = states.derivatives(state.drawn, state.z, state.points)
     damping = 0.1
     for _ in range(6):
         nearer, motion, damping = _step(states, shape, state, motion, damping)
@@ -312,7 +284,7 @@ def _step(
 ) -> tuple[StateOnShape, Float32[np.ndarray, "a 3 d"], float]:
     """Take Levenberg and Marquardt's step of the draws, the pose free; returns as ``lower`` does."""
     posed = Posed(state.rotation, state.translation, np.zeros(len(state.z)))
-    points = posed.place(state.points)
+    points = state.placed
     offset = points - shape.points
     weight = shape.weight * geman_mcclure(np.linalg.norm(offset, axis=1), 2 * ROBUST * shape.std)
     for _ in range(5):
@@ -347,13 +319,12 @@ def start_near(problem: DrawsProblem, modes: Posed) -> DrawsFit | None:
     """
     states = problem.states
     shape = Shape.of_material(problem, problem.model.material(modes.z))
-    guess = states.guess(modes.z, problem.model.motion)
-    laid = (lay_on_shape(states, shape, start, start.z) for start in (*similar_states(problem, shape), guess))
+    laid = (lay_on_shape(states, shape, start, start.z) for start in similar_states(problem, shape))
     starts = sorted((state for state in laid if state is not None), key=by_misfit)
     ends = list[StateOnShape]()
     for start in starts[: problem.config.approaching]:
         ends.append(approach(states, shape, start))
-        places = np.stack([end.points @ end.rotation.T + end.translation for end in ends])
+        places = np.stack([end.placed for end in ends])
         nearest = places[np.argmin([end.misfit for end in ends])]
         if np.count_nonzero(rms_distance(places - nearest) < shape.std) > 1:
             break
@@ -380,7 +351,7 @@ def refine_by_sight(problem: DrawsProblem, fit: DrawsFit) -> DrawsFit:
     start = simulate(dense, fit.drawn, fit.z, fit.posed)
     if start is None:
         return fit
-    fit = descend(dense, start, problem.config.last_rounds)
+    fit = descend(dense, replace(start, motion=fit.motion), 1)
     end = simulate(sighted, fit.drawn, fit.z, fit.posed)
     assert end is not None  # it was played before
     return replace(end, motion=fit.motion, misfit=fit.misfit)
@@ -393,7 +364,7 @@ def settled(problem: DrawsProblem, fit: DrawsFit) -> tuple[DrawsProblem, DrawsFi
     worth = replace(problem, base=problem.base.worth(fit.surface), by_sight=True)
     start = simulate(worth, fit.drawn, fit.z, fit.posed)
     assert start is not None  # it was played before
-    fit = descend(worth, start, problem.config.last_rounds)
+    fit = descend(worth, replace(start, motion=fit.motion), 1)
     return replace(worth, base=fit.base), fit
 
 
@@ -401,26 +372,21 @@ def similar_states(problem: DrawsProblem, shape: Shape) -> list[Drawn]:
     """Random states most like a shape."""
     states = problem.states
     some = spread(shape.points, 150)
-    library = states.material[:, states.played.index]
     goal = shape.points[some].astype(np.float32)
-    cost = robust_poses(library[:, some], goal, problem.base.first_sigma)[0]
+    cost = robust_poses(states.places[:, some], goal, problem.base.first_sigma)[0]
     return [states.drawn(states.seeds[row]) for row in np.argsort(cost)[: problem.config.starts]]
 
 
-def first_sigma(problem: DrawsProblem) -> float:
-    """The cloud's first standard deviation, scene units."""
-    return max(0.03 * problem.model.half, problem.base.cloud_sigma)
-
-
 def descend(problem: DrawsProblem, fit: DrawsFit, fresh: int) -> DrawsFit:
-    """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after one that is there."""
+    """Descend by Levenberg and Marquardt's method, with ``fresh`` sets of differences after that of the fit."""
+    assert fit.motion is not None
     config, least, motion = problem.config, problem.base.cloud_sigma, fit.motion
     index = problem.states.played.index
-    sigma = first_sigma(problem)
+    sigma = max(0.03 * problem.model.half, least)  # at first
     damping = 0.03
-    for number in range(fresh + (motion is not None)):
-        if number or motion is None:
-            motion = derivatives(problem.states, fit.drawn, fit.z, fit.material[index])
+    for number in range(1 + fresh):
+        if number:
+            motion = problem.states.derivatives(fit.drawn, fit.z, fit.material[index])
         start = fit.misfit
         for _ in range(config.steps):
             before = misfit(problem, fit, sigma)

@@ -6,6 +6,7 @@ normal. Played back in the order of the calls, the same shares give the same sta
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -16,7 +17,7 @@ from scipy.special import ndtr, ndtri
 
 from mereo.deformation.maps import Deformation
 from mereo.deformation.moving_least_squares import Anchors, PointWeights, spread
-from mereo.geometry.transforms import best_rotations, unit_rows
+from mereo.geometry.transforms import unit_rows
 from mereo.scenes.draw_recorder import SMOOTH, Call, OutOfDraws, Place, Recorder, Shares
 from mereo.scenes.parameters import play, random_state
 from mereo.scenes.random_states import state_points
@@ -160,9 +161,7 @@ class DrawnStates:
     """Random states of a scene by seed: where a fit of draws may start.
 
     Attributes:
-        material: their material points, scene frame.
-        z: their draws, standard normal; NaN of states with other calls than the first that was not drawn again.
-        modes: their coefficients in the statistical model.
+        places: of the played points in each, scene frame.
         played: points whose motion is played for derivatives.
         directions: where draws come from that are directions, and which of a call's numbers.
         recorded: what ``drawn`` has recorded so far.
@@ -170,9 +169,7 @@ class DrawnStates:
 
     scene: Scene
     seeds: tuple[int, ...]
-    material: Float32[np.ndarray, "n m 3"]
-    z: Float[np.ndarray, "n d"]
-    modes: Float[np.ndarray, "n k"]
+    places: Float32[np.ndarray, "n a 3"]
     played: Played
     directions: Directions
     recorded: dict[int, Drawn] = field(default_factory=dict)
@@ -189,36 +186,61 @@ class DrawnStates:
     ) -> "DrawnStates":
         """States of ``count`` seeds from ``first_seed`` on."""
         seeds = tuple(range(first_seed, first_seed + count))
-        material = []
-        calls = []
         played = Played.of(model)
+        places = []
+        calls = []
         for seed in seeds:
             recorder = Recorder(seed, {})
-            state = scene.deform(play(scene, recorder))
-            material.append(state_points(state, model.nodes, model.node_labels).astype(np.float32))
+            places.append(played.moved(play(scene, recorder)).astype(np.float32))
             calls.append(recorder.calls)
-        directions = find_directions(scene, played, calls)
-        draws = [Drawn.recorded(each, seed, directions).z for each, seed in zip(calls, seeds, strict=True)]
-        fewest = min(len(z) for z in draws)
-        z = np.stack([z if len(z) == fewest else np.full(fewest, np.nan) for z in draws])
-        modes = coefficients(model, np.stack(material))
-        return cls(scene, seeds, np.stack(material), z, modes, played, directions)
+        return cls(scene, seeds, np.stack(places), played, find_directions(scene, played, calls))
 
-    def guess(self, modes: Float[np.ndarray, " k"], motion: Float[np.ndarray, " k"]) -> Drawn:
-        """Draws of a state of these coefficients: ridge regression on states, those near it counting more.
+    @cached_property
+    def reach(self) -> Mapping[tuple[int, ...], Bool[np.ndarray, "s d"]]:
+        """Which segments each draw moves in one of two states, by the sizes of their calls: all where it moves none."""
+        reach = dict[tuple[int, ...], Any]()
+        for seed in self.seeds[:2]:
+            drawn = self.drawn(seed)
+            positions = self.played.moved(play(self.scene, Recorder(seed, {})))
+            parts = np.split(self._differences(drawn, drawn.z, positions, True), np.cumsum(self.played.counts)[:-1])
+            moves = ~np.stack([unmoving(part) for part in parts])
+            reach[drawn.sizes] = reach.get(drawn.sizes, False) | moves | ~moves.any(axis=0)
+        return reach
 
-        ``motion`` is how far a standard deviation of each mode moves; 100 states count as near.
+    def derivatives(
+        self, drawn: Drawn, z: Float[np.ndarray, " d"], positions: Float[np.ndarray, "a 3"]
+    ) -> Float32[np.ndarray, "a 3 d"]:
+        """Motion of the played points, which are ``positions``, for a standard deviation of each draw."""
+        return self._differences(drawn, z, positions, self.reach.get(drawn.sizes, True))
+
+    def _differences(
+        self, drawn: Drawn, z: Float[np.ndarray, " d"], positions: Float[np.ndarray, "a 3"], reach: Any
+    ) -> Float32[np.ndarray, "a 3 d"]:
+        """``derivatives``, where those of draws that reach other segments are played at once.
+
+        Curtis, Powell and Reid, "On the estimation of sparse Jacobian matrices", 1974. Neighbours are played without
+        the scene's own test where this state is the same without it: it is not where a scene refuses and draws again in
+        a way that ``Drawn`` does not see through.
         """
-        usable = np.flatnonzero(np.isfinite(self.z).all(axis=1))
-        apart = (((self.modes[usable] - modes) * motion) ** 2).sum(axis=1)
-        weight = 1.0 / (1.0 + apart / np.sort(apart)[min(100, len(apart)) - 1])
-        basis = np.concatenate([np.ones((len(usable), 1)), (self.modes[usable] - modes) * motion], axis=1)
-        weighted = basis * weight[:, None]
-        ridge = 1e-3 * weight.sum() * float((motion**2).mean()) * np.eye(basis.shape[1])
-        ridge[0, 0] = 0.0
-        answer = np.linalg.solve(weighted.T @ basis + ridge, weighted.T @ self.z[usable])[0]
-        like = self.drawn(self.seeds[usable[0]])
-        return replace(like, z=np.where(like.smooth, np.clip(answer, -2.0, 2.0), like.z))
+        reach = np.broadcast_to(reach, (len(self.played.counts), len(z)))
+        change = np.zeros((*positions.shape, len(z)), dtype=np.float32)
+        untested = drawn.deformations(self.scene, z, checked=False)
+        checked = (
+            untested is None or float(np.abs(self.played.moved(untested) - positions).max()) > 1e-4
+        )  # rest points are in single precision
+        step = np.where(z > 0, -0.02, 0.02)
+        moves = np.repeat(reach, self.played.counts, axis=0)
+        groups = draws_apart(reach, np.flatnonzero(drawn.smooth))
+        for numbers in groups:
+            other = z.copy()
+            other[numbers] += step[numbers]
+            moved = drawn.deformations(self.scene, other, checked)
+            if moved is None:  # one of several may be why
+                groups += [np.array([number]) for number in numbers if len(numbers) > 1]
+            else:
+                motion = (self.played.moved(moved) - positions)[..., None] / step[numbers]
+                change[:, :, numbers] = motion * moves[:, None, numbers]
+        return change
 
 
 def find_directions(scene: Scene, played: Played, states: Sequence[Sequence[Call]]) -> Directions:
@@ -255,21 +277,19 @@ def is_direction(scene: Scene, played: Played, drawn: Drawn, numbers: Numbers) -
     return len(share) > 1 and moves(share[::-1]) and not moves(share / 2)
 
 
-def coefficients(model: StatisticalModel, material: Float32[np.ndarray, "n m 3"]) -> Float[np.ndarray, "n k"]:
-    """Coefficients of many states at once, by a few rounds of alignment and least squares on a few material points."""
-    few = spread(model.rest_points, 400)
-    flat = model.modes[few].reshape(-1, model.count).astype(np.float64)
-    normal = flat.T @ flat + 1e-6 * np.trace(flat.T @ flat) / model.count * np.eye(model.count)
-    states = material[:, few].astype(np.float64)
-    states -= states.mean(axis=1, keepdims=True)
-    z = np.zeros((len(states), model.count))
-    for _ in range(4):
-        goal = model.mean[few] + (z @ flat.T).reshape(len(z), -1, 3)
-        center = goal.mean(axis=1, keepdims=True)
-        rotation = best_rotations(np.matmul(states.transpose(0, 2, 1), goal - center))
-        aligned = np.matmul(states, rotation.transpose(0, 2, 1)) + center
-        z = np.linalg.solve(normal, flat.T @ (aligned - model.mean[few]).reshape(len(z), -1).T).T
-    return z
+def unmoving(motion: Float32[np.ndarray, "a 3 d"]) -> Bool[np.ndarray, " d"]:
+    """Mark the draws that move nothing."""
+    return np.asarray(np.abs(motion).max(axis=(0, 1)) < 1e-9)  # scene units
+
+
+def draws_apart(reach: Bool[np.ndarray, "s d"], numbers: Numbers) -> list[Numbers]:
+    """Put draws that reach no segment together into groups, each into the first that has room for it."""
+    taken = np.zeros((len(reach), len(numbers)), dtype=bool)
+    group = np.empty(len(numbers), dtype=int)
+    for row, number in enumerate(numbers):
+        group[row] = np.argmin((taken & reach[:, [number]]).any(axis=0))
+        taken[:, group[row]] |= reach[:, number]
+    return [numbers[group == each] for each in np.unique(group)]
 
 
 def material_moved(
