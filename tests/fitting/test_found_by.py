@@ -15,8 +15,13 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.correspondences import find_correspondences
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import (
+    ACCEPTED,
+    CLEAN,
+    SHARED,
+    SIGMAS,
     is_normal,
     noise_of,
+    shared,
     shared_variance,
 )
 from mereo.fitting.problem.residuals import Surface
@@ -187,14 +192,23 @@ def test_the_noise_left_is_what_points_have_alone_and_as_much_as_neighbours_shar
         assert problem.left_noise(surface) == pytest.approx(expected, rel=0.1)
 
 
+def test_the_first_noise_is_what_the_cloud_shows(points: np.ndarray) -> None:
+    calm, rough = (Evidence.of(cloud) for cloud in (points, noisy(points, 0.4)))
+    assert calm.noise < CLEAN and 0.3 < rough.noise < 0.5
+    assert replace(rough, shared_noise=SharedNoise(0.3)).noise == pytest.approx(np.hypot(rough.noise, 0.3))
+
+
 def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None:
-    """An offset of half of the points is the fit's; what each has for itself is the camera's."""
+    """An offset of all points, or of half of them, is the fit's; what each has for itself is the camera's."""
     around = Evidence.of(points).around
     rng = default_rng(0)
     own = rng.normal(scale=0.3, size=len(points))
     half = np.where(points[:, 0] > np.median(points[:, 0]), 2.0, 0.0)
     assert noise_of(own, around) == pytest.approx(0.3, rel=0.1)
+    assert noise_of(own + 1.0, around) == pytest.approx(0.3, rel=0.1)
     assert noise_of(half, around) == 0.0
+    assert 0.97 < shared(own, around, 0.45) < SHARED
+    assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
 
 
 def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
@@ -265,6 +279,21 @@ def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registra
     assert problem.explained(9.0, found.surface, 0.1)
     assert not problem.explained(9.0, Surface.through(problem.model, aside), 0.1)
     assert not problem.with_noise(0.0).explained(9.0, found.surface, 0.1)
+
+
+def test_constants_follow_the_noise_and_end(registrar: Registrar, points: np.ndarray) -> None:
+    problem = fitted(registrar, points).modes.problem
+    config = problem.config
+
+    def constants(noise: float) -> tuple[float, float, float]:
+        of = problem.with_noise(noise)
+        return of.cloud_sigma, of.tolerance, of.accepted
+
+    clean = (config.cloud_sigma, config.tolerance, config.accepted)
+    assert constants(0.0) == constants(CLEAN) == clean and not problem.with_noise(CLEAN).is_noisy
+    assert constants(0.2) == pytest.approx((0.3, 0.6, ACCEPTED)) and problem.with_noise(0.2).is_noisy
+    largest = 0.01 * np.median(norm(points, axis=1))  # of a camera, whatever the object's size
+    assert constants(99.0)[0] == pytest.approx(SIGMAS * largest, rel=0.02)
 
 
 def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:

@@ -224,8 +224,12 @@ def test_the_kept_model_is_another_for_another_solid(tmp_path: Path, scene: Scen
 # --- fits -------------------------------------------------------------------------------------------------------------
 
 
-def test_a_search_finds_a_state_of_the_solid(scene: Scene, model: StatisticalModel) -> None:
-    state = scene.sample_state(example_rng(7, 5))  # others are explained as well turned end for end
+TURNED = pytest.param(0, marks=pytest.mark.xfail(reason="explained as well turned end for end", strict=False))
+
+
+@pytest.mark.parametrize("index", [5, TURNED])
+def test_a_search_finds_a_state_of_the_solid(scene: Scene, model: StatisticalModel, index: int) -> None:
+    state = scene.sample_state(example_rng(7, index))
     true = transform_points(IN_FRONT, state_points(state, model.nodes, model.node_labels))
     fitted = search_modes(CloudToFit(seen(state.mesh.transformed(IN_FRONT)), 1.0), model, ELASTIC)
     distance = fitted.surface.nearest(fitted.problem.evidence.observed_samples)[0]

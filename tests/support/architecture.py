@@ -130,7 +130,7 @@ BUDGET = {
     "src/mereo_serving": (10_580, 13),
     "src/mereo_viewer": (11_990, 5),
     "src/mereo_experiments": (11_190, 16),
-    "tests": (294_080, 139),
+    "tests": (294_470, 139),
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
