@@ -10,7 +10,7 @@ import pytest
 
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import ACCEPTED
-from mereo.fitting.registration.answer_frame import answer_frame
+from mereo.fitting.registration.answer_frame import answer_frame, answer_of
 from mereo.fitting.registration.recognition import (
     FEATURELESS,
     FIT,
@@ -133,16 +133,18 @@ def patch(bend: float) -> PointCloud:
 
 def test_a_smooth_patch_is_not_believed(model: StatisticalModel) -> None:
     """As large a part of the object explains it, and of everything else; the rest of the object was not seen."""
-    seen = observe(patch(0.0))
-    part, whole = (answer_frame(each, None, Registrar(None, model)) for each in (replace(seen, extent="partial"), seen))
-    assert part.recognition.known == "unsure" and part.recognition.reason == FEATURELESS
-    assert whole.recognition.known is not True and whole.recognition.signs.unseen > 0.5
-    merged = replace(seen, extent="partial")
+    seen, registrar = observe(patch(0.0)), Registrar(None, model)
+    partial, merged = replace(seen, extent="partial"), replace(seen, extent="partial")
     vars(merged)["self_hidden"] = 0.3  # as if another view's points lay behind: nothing believes it, tracked or not
-    again = answer_frame(merged, None, Registrar(None, model)).recognition
+    part, whole = (answer_frame(each, None, registrar) for each in (partial, seen))
+    assert part.recognition.known is not True
+    assert whole.recognition.known is not True and whole.recognition.signs.unseen > 0.5
+    perfect = replace(part.registration, explained=1.0, method="rest")  # which of many states is met first is chance
+    said, again = (answer_of(each, None, registrar, part.candidate, perfect).recognition for each in (partial, merged))
+    assert said.known == "unsure" and said.reason == FEATURELESS
     assert again.known == "unsure" and again.reason == merged.doubt and "30% of the points lie behind" in again.reason
     refused = Recognition(False, "too small")
-    assert refused.doubted(merged.doubt) is refused and part.recognition.doubted(None) is part.recognition
+    assert refused.doubted(merged.doubt) is refused and said.doubted(None) is said
 
 
 def test_only_a_patch_is_explained_by_a_patch() -> None:
