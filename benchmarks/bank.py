@@ -32,7 +32,7 @@ from search import OBJECTS as SHIPPED
 
 from mereo.fitting import modes, search
 from mereo.fitting.draws import fit as draws_fit
-from mereo.fitting.modes import ScoredFit, refine
+from mereo.fitting.modes import ScoredFit, refined
 from mereo.fitting.problem.evidence import SILHOUETTE_PITCHES, Evidence
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed
 from mereo.fitting.problem.problem import Misfit, Problem
@@ -64,13 +64,13 @@ CELLS = 48
 FAR = 2.5
 """Distance, in scene units, up to which an observed point is compared along its line of sight."""
 
-FITTED = ("fitted", "shaken", "noisy", "heavier")
+FITTED = ("fitted", "turned", "noisy", "heavier")
 """Stages of the fits of the modes. Besides there are "screened" and "bent", which are kept and not measured, "rest" and
 "draws", "settled" and "draws settled", the ends under noise, and "truth", the model's own nearest to the true state,
 with "from truth", the fit that starts there."""
 
 WITHIN: dict[str, str] = {
-    "shaken": "shaken",
+    "turn": "turned",
     "in_problem": "noisy",
     "with_heavier_cloud": "heavier",
     "fit_rest": "rest",
@@ -264,7 +264,7 @@ def from_truth(recorder: Recorder, material: Float[np.ndarray, "m 3"], model: St
         T, z = model.project(material / one.unit)
         start = Posed(T[:3, :3], T[:3, 3], z)
         recorder.unit = one.unit
-        for stage, posed in (("truth", start), ("from truth", refine(problem, start))):
+        for stage, posed in (("truth", start), ("from truth", refined(problem, start).posed)):
             fit = ScoredFit.of(problem, posed)
             recorder.candidates.append(Candidate(stage, problem, one.unit, posed, fit.surface, fit.misfit))
 

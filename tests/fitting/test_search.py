@@ -14,7 +14,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from mereo.fitting.config import FitConfig
-from mereo.fitting.modes import ScoredFit, fit_wide, refined
+from mereo.fitting.modes import ScoredFit, fit_from_far
 from mereo.fitting.problem.evidence import (
     MOST_POINTS,
     OBSERVED_SAMPLES,
@@ -179,10 +179,7 @@ def test_under_noise_a_part_is_hidden_where_it_is_by_the_noises_constants_too(
     evidence = Evidence.of(points)
     whole = Problem(model, evidence, OPEN_SCALE_STD, FitConfig()).with_noise(evidence.noise)
     partial = whole.changed(evidence=replace(evidence, other_lines="unknown"))
-    trails = [
-        Trail(each, handicap, [refined(each, fit_wide(each, posed))])
-        for each, handicap in ((whole, 0.0), (partial, WHOLE))
-    ]
+    trails = [Trail(each, handicap, [fit_from_far(each, posed)]) for each, handicap in ((whole, 0.0), (partial, WHOLE))]
     assert whole.is_noisy and likelier(trails).problem is (partial if share else whole)
 
 

@@ -130,11 +130,11 @@ BUDGET = {
     "src/mereo_serving": (10_580, 13),
     "src/mereo_viewer": (11_990, 5),
     "src/mereo_experiments": (11_190, 16),
-    "tests": (294_470, 139),
+    "tests": (294_250, 139),
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 
-CHOICES = {"src/mereo/fitting": (230, 129), "src/mereo/locating": (31, 30)}
+CHOICES = {"src/mereo/fitting": (226, 126), "src/mereo/locating": (31, 30)}
 """Decisions (``if`` statements and expressions) and numbers in module constants that a folder may have at most.
 
 They choose among fits, and they only fall."""

@@ -3,7 +3,7 @@
 1. Cloud, silhouette and free space, from wide to narrow.
 2. The same again under the Gaussian of the library's states near the answer: states lie on curved sets, of which it is
    the tangent.
-3. While the cloud is not explained, other states around the best fit, where the states lie on a curved set at all.
+3. From where another state lies, with another side of the object there.
 """
 
 from dataclasses import dataclass, replace
@@ -11,13 +11,18 @@ from functools import lru_cache
 from operator import attrgetter
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, Int
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
+from mereo.deformation.moving_least_squares import PointWeights
+from mereo.fitting.problem.correspondences import fit_places
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed
 from mereo.fitting.problem.problem import Misfit, Problem
-from mereo.fitting.problem.residuals import Prior, Surface
-from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
+from mereo.fitting.problem.residuals import PlacesTerm, Prior, Surface
+from mereo.fitting.problem.segments import corner_positions, diverse_rows, principal_axes, rms_distance
 from mereo.geometry.transforms import best_rotations, fit_rigid
+from mereo.scenes.statistical_model import StatisticalModel
 
 REFINE_SIGMA = 0.02
 """The cloud's first standard deviation in a refinement, as all sigmas of this module a share of ``half``."""
@@ -26,41 +31,39 @@ PAIR_SLACK = 0.05
 """How far the kept distances may be off at first; it falls in each step."""
 
 
+def fit_from_far(problem: Problem, posed: Posed) -> "ScoredFit":
+    """Fit from a state that may be far off, first under the prior of all states."""
+    prior = Prior.whole(problem.model)
+    return refined(problem, fit_cloud(problem, posed, prior, problem.config.start_sigma, 15, PAIR_SLACK))
+
+
 def refined(problem: Problem, posed: Posed) -> "ScoredFit":
-    """Return the better of a state and its refinement."""
-    return ScoredFit.of(problem, posed).better(problem, refine(problem, posed))
+    """Return the better of a state and its refinement under the prior of the library's 50 states nearest to it."""
+    near = fit_cloud(problem, posed, Prior.near(problem.model, posed.z), REFINE_SIGMA, 10, 0.0)
+    return min((ScoredFit.of(problem, each) for each in (posed, near)), key=total_misfit)
 
 
-SHAKES, SHAKEN, CURVED = 8, 12, 300
-"""Rounds of shaking at most, and starts in each; and from how many kept distances on the states lie on a curved set,
-while smooth bending has one optimum."""
-
-HOPELESS = 4.0
-"""Misfit of the cloud from which on a fit is of something else: after two rounds of a search own views have up to 2.6,
-most else 4.3 to 6."""
+TURNS = 6
+"""Turns about each axis of the rest pose, evenly over a whole one, of which the first is none."""
 
 
-@lru_cache(maxsize=4)  # a search may come back to fits around which it has found nothing better
-def shaken(problem: Problem, best: "ScoredFit") -> "ScoredFit":
-    """Fit again from states around the best, drawn from the prior's spread, as long as one of them is better.
+@lru_cache(maxsize=4)
+def turns_at_rest(model: StatisticalModel) -> Int[np.ndarray, "t p"]:
+    """Material points that are nearest to where few of them are after turns of the rest pose."""
+    rest = model.rest_points
+    center, axes = principal_axes(*model.rest.merged()[:2])
+    angles = 2 * np.pi * np.arange(1, TURNS) / TURNS
+    turns = Rotation.from_rotvec(np.concatenate(np.multiply.outer(angles, axes))).as_matrix()
+    return cKDTree(rest).query(center + (rest[model.sparse] - center) @ turns)[1]
 
-    What folds or has joints has many optima next to each other, and the right one is rarely far from a wrong one. Not
-    where the unit is unknown: frames of other things are explained no less without it, and cost a third more with it.
-    """
-    rng = np.random.default_rng(0)
-    for _ in range(SHAKES * (len(problem.model.pairs) >= CURVED and not problem.is_scale_open)):
-        is_over = best.explains(problem) or best.misfit.cloud > HOPELESS
-        if is_over or (problem.is_noisy and problem.share_on(best.surface) < problem.accepted):
-            break
-        before = best
-        z = best.posed.z
-        starts = [replace(best.posed, z=z + rng.standard_normal(len(z))) for _ in range(SHAKEN)]
-        wide = [ScoredFit.of(problem, fit_wide(problem, posed)) for _, posed in bend_by_few(problem, starts, 3)[:3]]
-        nearest = min(wide, key=total_misfit)
-        best = min(best, nearest.better(problem, refine(problem, nearest.posed)), key=total_misfit)
-        if best is before:
-            break
-    return best
+
+def turned(problem: Problem, posed: Posed) -> list[Posed]:
+    """States that lie where one lies, bent alike, with another side of the object there."""
+    model = problem.model
+    material = posed.place(model.material(posed.z))
+    few = PointWeights(model.sparse[:, None], np.ones((len(model.sparse), 1)))
+    terms = [PlacesTerm(material[rows], few, few.weight[:, 0]) for rows in turns_at_rest(model)]
+    return [fit_places(problem, term, posed.z, posed.log_scale) for term in terms]
 
 
 BENDING = ((0.12, 5, 0.05), (0.05, 8, 0.02))
@@ -113,24 +116,8 @@ class ScoredFit:
         """Whether the state explains the cloud, noise aside."""
         return problem.explained(self.misfit.cloud, self.surface, problem.config.explained)
 
-    def better(self, problem: Problem, other: Posed) -> "ScoredFit":
-        """Return this fit, or another state where its misfit is lower."""
-        scored = ScoredFit.of(problem, other)
-        return scored if scored.misfit.total < self.misfit.total else self
-
 
 total_misfit = attrgetter("misfit.total")
-
-
-def fit_wide(problem: Problem, posed: Posed) -> Posed:
-    """Fit from a state that may be far off, under the prior of all states."""
-    return fit_cloud(problem, posed, Prior.whole(problem.model), problem.config.start_sigma, 15, PAIR_SLACK)
-
-
-def refine(problem: Problem, posed: Posed) -> Posed:
-    """Fit from nearby, under the prior of the library's 50 states nearest to ``posed``."""
-    prior = Prior.near(problem.model, posed.z)
-    return fit_cloud(problem, posed, prior, REFINE_SIGMA, 10, 0.0)
 
 
 def fit_cloud(problem: Problem, posed: Posed, prior: Prior, start: float, steps: int, slack: float) -> Posed:

@@ -6,7 +6,8 @@
    frame (``Screen``).
 2. The best that differ are bent towards the frame by few points, from wide to narrow.
 3. The best of these are fitted as a frame always is, as long as they may be better or as good.
-4. Where the frame is not explained, the same again from other states of the library.
+4. Unless that explains a clean frame, it is fitted with another side of the object there, as long as that is better.
+5. Where the frame is not explained, the same again from other states of the library.
 
 Poses of a mechanism bend in the first step, from several states, and states near the best of them are tried too.
 
@@ -29,17 +30,18 @@ from scipy.spatial.transform import Rotation
 from mereo.deformation.maps import crossing
 from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import (
+    BENDING,
     BENT_APART,
     ScoredFit,
     bend_by_few,
     differing,
     fit_cloud,
-    fit_wide,
+    fit_from_far,
     refined,
     robust_poses,
     settled_once,
-    shaken,
     total_misfit,
+    turned,
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
@@ -701,8 +703,8 @@ SAME, MOST_PLACES = 0.04, 0.95
 KEPT = 4
 """Fits that differ, which another problem of the frame begins with."""
 
-SHAKEN_FITS = 3
-"""Fits that differ, around each of which states are tried in each round."""
+TURNED = 3
+"""Turned states that are fitted at most."""
 
 HEAVIER_STEPS = (0.04, 12)
 HELPS = 0.65
@@ -765,19 +767,24 @@ class Trail:
         for cost, posed in ranked[: stage.fitted]:
             if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=total_misfit).explains(self.problem):
                 break
-            fitted.append(refined(self.problem, fit_wide(self.problem, posed)))
+            fitted.append(fit_from_far(self.problem, posed))
         self.fitted += fitted
         places = corner_positions(self.problem.model, [fit.posed for fit in (self.best, *fitted)])
         near = rms_distance(places[1:] - places[0]) < BENT_APART * self.problem.model.half
         self.is_repeated = int(near.sum()) > 1
 
-    def shake(self) -> None:
-        """Fit again from states around the best fits that differ: an object that looks alike turned is one of them."""
-        ranked = sorted(self.fitted, key=total_misfit)
-        for row in differing(self.problem, [scored.posed for scored in ranked], APART)[:SHAKEN_FITS]:
-            if self.is_explained:
-                return
-            self.fitted.append(shaken(self.problem, ranked[row]))
+    def turn(self) -> None:
+        """Fit again with another side of the object where the best state lies, as long as that is better.
+
+        Not where few points show that it is worse: they would have to be bent to it more than they have been.
+        """
+        problem = self.problem
+        before = None
+        while self.best is not before:
+            before = self.best
+            most = problem.coarse.screen(before.posed, BENDING[-1][2] * problem.model.half).total
+            ranked = bend_by_few(problem, turned(problem, before.posed), TURNED)[:TURNED]
+            self.fitted += [fit_from_far(problem, posed) for cost, posed in ranked if cost < most]
 
     def with_heavier_cloud(self) -> "Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
@@ -795,7 +802,7 @@ class Trail:
         """The same from its best states that differ, in another problem of the frame."""
         states = [scored.posed for scored in sorted(self.fitted, key=total_misfit)]
         rows = differing(problem, states, BENT_APART)[:KEPT]
-        fits = [refined(problem, fit_wide(problem, states[row])) for row in rows]
+        fits = [fit_from_far(problem, states[row]) for row in rows]
         return Trail(problem, self.handicap, fits, self.is_repeated)
 
     def with_shared_noise(self) -> "Trail":
@@ -807,7 +814,7 @@ class Trail:
         trail = self.in_problem(problem.by_every_point)
         if not trail.leaves_noise:
             return self
-        trail.shake()
+        trail.turn()
         return trail if trail.leaves_noise else self
 
     @property
@@ -849,7 +856,7 @@ def search(
     trails = [Trail(whole)] if partial is None else [Trail(whole), Trail(partial, WHOLE)]
     if starts:
         for trail in trails:
-            trail.fitted += [refined(trail.problem, fit_wide(trail.problem, start)) for start in starts]
+            trail.fitted += [fit_from_far(trail.problem, start) for start in starts]
         chosen = likelier(with_left_noise(trails))
         if not rounds or (chosen.is_explained and not chosen.problem.shares_noise):
             return chosen.with_heavier_cloud() or chosen.with_shared_noise()
@@ -866,7 +873,7 @@ def search(
             trail.fitted.append(refined(trail.problem, other.best.posed))
         trails = with_left_noise(trails)
         chosen = likelier(trails)
-        chosen.shake()
+        chosen.turn()
         heavier = chosen.with_heavier_cloud()
         if chosen.is_explained or chosen.is_repeated or (heavier is not None and heavier.is_explained):
             break

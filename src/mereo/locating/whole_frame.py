@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial import ConvexHull, cKDTree
 
-from mereo.fitting.modes import bend_by_few, fit_wide, refined
+from mereo.fitting.modes import bend_by_few, fit_from_far
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.registration.answer import Answer, Candidate
@@ -231,7 +231,7 @@ class WholeFrame:
             problem = self.problem(self.chosen(place))
         except NoFit:
             return place
-        return self.place(place.mask, [refined(problem, fit_wide(problem, first)).posed, *others])
+        return self.place(place.mask, [fit_from_far(problem, first).posed, *others])
 
     def answered(
         self, place: Place, model: Trained | None, keep_all: bool, rounds: Sequence[SearchRound]

@@ -5,6 +5,7 @@ modes, with the same residuals. The scene is played with the draws that fit best
 """
 
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 from jaxtyping import Float, Float32, Int
@@ -124,9 +125,7 @@ def misfit(problem: DrawsProblem, fit: DrawsFit, sigma: float) -> float:
     )
 
 
-def by_misfit(state: "DrawsFit | StateOnShape") -> float:
-    """Misfit, as a key to sort by."""
-    return state.misfit
+by_misfit = attrgetter("misfit")
 
 
 def narrowing(problem: DrawsProblem, fit: DrawsFit) -> float:

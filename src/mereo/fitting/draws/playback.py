@@ -182,7 +182,7 @@ class DrawnStates:
 
     @classmethod
     def of(
-        cls, scene: Scene, model: StatisticalModel, count: int = 600, first_seed: int = STATES_SEED
+        cls, scene: Scene, model: StatisticalModel, count: int = 150, first_seed: int = STATES_SEED
     ) -> "DrawnStates":
         """States of ``count`` seeds from ``first_seed`` on."""
         seeds = tuple(range(first_seed, first_seed + count))

@@ -12,10 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mereo.deformation.moving_least_squares import spread
+from mereo.deformation.moving_least_squares import PointWeights, spread
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
-from mereo.fitting.problem.residuals import ROBUST, NetworkTerm, Prior
+from mereo.fitting.problem.residuals import ROBUST, PlacesTerm, Prior
 from mereo.geometry.transforms import robust_rigid
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
@@ -78,29 +78,35 @@ def find_correspondences(network: Trained, code: EncodedCloud, model: Statistica
 
 
 def fit_correspondences(problem: Problem, matches: Correspondences, unit: float) -> tuple[Problem, Posed]:
-    """Fit pose and modes to correspondences alone, from the mean state and from wide to narrow.
+    """Fit pose and modes to correspondences alone, from the mean state.
 
     ``unit`` is the length of a scene unit of the problem in that of the correspondences. Returns the problem with them
     as its ``network``, too.
     """
     model = problem.model
-    target = matches.points / unit
-    sigma = problem.first_sigma
-    weights = model.weights(matches.rest, matches.labels)
-    mean = weights(model.mean)
+    term = PlacesTerm(matches.points / unit, model.weights(matches.rest, matches.labels), matches.confidence)
     scale = scale_of(matches, unit) if problem.is_scale_open else 1.0
-    T = robust_rigid(scale * mean, target, matches.confidence, sigma)
-    posed = Posed(T[:3, :3], T[:3, 3], np.zeros(model.count), float(np.log(scale)))
+    return replace(problem, network=term), fit_places(problem, term, np.zeros(model.count), float(np.log(scale)))
+
+
+def fit_places(problem: Problem, term: PlacesTerm, z: Float[np.ndarray, " k"], log_scale: float) -> Posed:
+    """Fit pose and modes to places alone, from wide to narrow, beginning with coefficients and a scale."""
+    model, sigma = problem.model, problem.first_sigma
+    rows, index = np.unique(term.weights.index, return_inverse=True)
+    weights = PointWeights(index.reshape(term.weights.index.shape), term.weights.weight)
+    points = weights(model.positions(z[None], rows)[0])
+    T = robust_rigid(np.exp(log_scale) * points, term.target, term.confidence, sigma)
+    posed = Posed(T[:3, :3], T[:3, 3], z, log_scale)
     for std in sigma * WIDE ** np.linspace(1.0, 0.0, STEPS):
-        points = posed.place(weights(model.material(posed.z)))
-        motion = weights(model.tangent(posed.z))
-        offset = points - target
-        weight = matches.confidence / matches.confidence.sum() * (WORTH / std**2)
+        points = posed.place(weights(model.positions(posed.z[None], rows)[0]))
+        motion = weights(model.tangent(posed.z, rows))
+        offset = points - term.target
+        weight = term.confidence / term.confidence.sum() * (WORTH / std**2)
         weight = weight * geman_mcclure(np.linalg.norm(offset, axis=1), ROBUST * std)
         normal = problem.known(posed, Prior.whole(model), 0.0)
         normal = normal.add(in_space(posed, points, motion), offset.ravel(), np.repeat(weight, 3))
         posed = posed.moved(normal.step(DAMPING))
-    return replace(problem, network=NetworkTerm(target, weights, matches.confidence)), posed
+    return posed
 
 
 def scale_of(matches: Correspondences, unit: float) -> float:

@@ -29,8 +29,8 @@ from mereo.fitting.problem.gauss_newton import (
 from mereo.fitting.problem.residuals import (
     ROBUST,
     Met,
-    NetworkTerm,
     PairTerm,
+    PlacesTerm,
     PosedSamples,
     Prior,
     SampledSurface,
@@ -105,7 +105,7 @@ class Problem:
     config: FitConfig
     noise: float = 0.0
     given: GivenPose | None = None
-    network: NetworkTerm | None = None
+    network: PlacesTerm | None = None
 
     @property
     def is_scale_open(self) -> bool:
@@ -172,10 +172,6 @@ class Problem:
         alone = noise_of(offset, self.evidence.around)
         return min(max(noise_of(offset), alone), float(np.hypot(alone, self.evidence.expected_noise)))
 
-    def share_on(self, surface: Surface) -> float:
-        """Share of the observed samples that lie on a surface, up to the tolerance."""
-        return float((self.nearest(surface)[0] <= self.tolerance).mean())
-
     def worth(self, surface: Surface) -> "Problem":
         """The problem with as many independent points as what a fit leaves over shows that the cloud is worth.
 
@@ -235,7 +231,11 @@ class Problem:
         Of that neighbours may share as much as they do around the object, and as many points as are to be accepted must
         lie on the surface.
         """
-        if cloud < most or not self.shares_noise or self.share_on(surface) < self.config.accepted:
+        if (
+            cloud < most
+            or not self.shares_noise
+            or (self.nearest(surface)[0] <= self.tolerance).mean() < self.config.accepted
+        ):
             return cloud < most
         offset = self.offsets(surface, self.far)
         evidence = self.evidence

@@ -274,8 +274,8 @@ class Surface:
 
 
 @dataclass(frozen=True, eq=False)
-class NetworkTerm:
-    """Where a network has places of the object.
+class PlacesTerm:
+    """Where a network has places of the object, or another state has them.
 
     Attributes:
         target: in the camera frame, scene units.

@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from mereo.deformation.moving_least_squares import spread
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.residuals import robust_square
-from mereo.geometry.mesh import Segment
+from mereo.geometry.mesh import Segment, area_vectors
 from mereo.geometry.transforms import best_rotations, fit_rigid
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -32,22 +32,10 @@ def corners_of(model: StatisticalModel) -> Int[np.ndarray, "s c"]:
     return np.stack([anchors[: min(12, least)] for anchors in model.anchors])
 
 
-def positions(
-    model: StatisticalModel, corners: Int[np.ndarray, "s c"], z: Float32[np.ndarray, "n k"]
-) -> Float[np.ndarray, "n s c 3"]:
-    """Positions of the corners in states."""
-    return model.positions(z, corners.ravel()).reshape(len(z), *corners.shape, 3)
-
-
-def sampled_positions(model: StatisticalModel, corners: Int[np.ndarray, "s c"]) -> Float[np.ndarray, "n s c 3"]:
-    """Positions of the corners in about 60 states of the library."""
-    return positions(model, corners, model.library[:: max(1, len(model.library) // 60)])
-
-
 def corner_positions(model: StatisticalModel, states: list[Posed]) -> Float[np.ndarray, "n p 3"]:
     """Positions of the corners of all segments in the camera frame, by which states are compared."""
     z = np.stack([posed.z for posed in states]).astype(np.float32)
-    unposed = positions(model, corners_of(model), z).reshape(len(z), -1, 3)
+    unposed = model.positions(z, corners_of(model).ravel())
     return np.stack([posed.place(points) for posed, points in zip(states, unposed, strict=True)])
 
 
@@ -148,10 +136,12 @@ def find_segment_turns(model: StatisticalModel) -> tuple[SegmentTurns, ...]:
     corners = corners_of(model)
     symmetries = list[SegmentTurns]()
     # from the rest pose, not from the mean, in which a part that spins is crushed
-    rotation = segment_poses(model.rest_points[corners], sampled_positions(model, corners))[0]
+    library = model.library[:: max(1, len(model.library) // 60)]
+    states = model.positions(library, corners.ravel()).reshape(len(library), *corners.shape, 3)
+    rotation = segment_poses(model.rest_points[corners], states)[0]
     joints = branches(model)
     for index, segment in enumerate(model.rest.segments):
-        center, axes = principal_axes(segment)
+        center, axes = principal_axes(segment.vertices, segment.faces)
         for axis in axes:
             alike = ANGLES[self_distances(segment, center, axis) <= ALIKE]
             neighbors = {b if a == index else a for a, b, _ in joints if index in (a, b)}
@@ -162,11 +152,12 @@ def find_segment_turns(model: StatisticalModel) -> tuple[SegmentTurns, ...]:
     return tuple(symmetries)
 
 
-def principal_axes(segment: Segment) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
-    """Centroid of a segment's surface, and its principal axes as rows."""
-    corners = segment.vertices[segment.faces]
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    middle = corners.mean(axis=1)
+def principal_axes(
+    vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Centroid of a surface, and its principal axes as rows."""
+    area = np.linalg.norm(area_vectors(vertices, faces), axis=1)
+    middle = vertices[faces].mean(axis=1)
     center = area @ middle / area.sum()
     covariance = ((middle - center) * area[:, None]).T @ (middle - center)
     return center, np.linalg.eigh(covariance)[1].T
