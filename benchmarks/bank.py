@@ -264,9 +264,8 @@ def from_truth(recorder: Recorder, material: Float[np.ndarray, "m 3"], model: St
         T, z = model.project(material / one.unit)
         start = Posed(T[:3, :3], T[:3, 3], z)
         recorder.unit = one.unit
-        for stage, posed in (("truth", start), ("from truth", refined(problem, start).posed)):
-            fit = ScoredFit.of(problem, posed)
-            recorder.candidates.append(Candidate(stage, problem, one.unit, posed, fit.surface, fit.misfit))
+        for stage, fit in (("truth", ScoredFit.of(problem, start)), ("from truth", refined(problem, start))):
+            recorder.candidates.append(Candidate(stage, problem, one.unit, fit.posed, fit.surface, fit.misfit))
 
 
 def record(frame: BankView) -> dict[str, Any]:

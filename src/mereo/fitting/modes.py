@@ -51,7 +51,7 @@ TURNS = 6
 def turns_at_rest(model: StatisticalModel) -> Int[np.ndarray, "t p"]:
     """Material points that are nearest to where few of them are after turns of the rest pose."""
     rest = model.rest_points
-    center, axes = principal_axes(*model.rest.merged()[:2])
+    center, axes = principal_axes(rest, model.faces)
     angles = 2 * np.pi * np.arange(1, TURNS) / TURNS
     turns = Rotation.from_rotvec(np.concatenate(np.multiply.outer(angles, axes))).as_matrix()
     return cKDTree(rest).query(center + (rest[model.sparse] - center) @ turns)[1]

@@ -732,12 +732,14 @@ class Trail:
     Attributes:
         handicap: misfit by which another hypothesis is likelier before the frame was seen.
         is_repeated: whether several starts of a round ended in the best state, so that others would, too.
+        turned: the best state when that was turned last, which a round may not have bettered.
     """
 
     problem: Problem
     handicap: float = 0.0
     fitted: list[ScoredFit] = field(default_factory=list)
     is_repeated: bool = False
+    turned: ScoredFit | None = None
 
     @property
     def best(self) -> ScoredFit:
@@ -779,12 +781,12 @@ class Trail:
         Not where few points show that it is worse: they would have to be bent to it more than they have been.
         """
         problem = self.problem
-        before = None
-        while self.best is not before:
-            before = self.best
-            most = problem.coarse.screen(before.posed, BENDING[-1][2] * problem.model.half).total
-            ranked = bend_by_few(problem, turned(problem, before.posed), TURNED)[:TURNED]
-            self.fitted += [fit_from_far(problem, posed) for cost, posed in ranked if cost < most]
+        while self.best is not self.turned:
+            self.turned = self.best
+            posed = self.turned.posed
+            most = problem.coarse.screen(posed, BENDING[-1][2] * problem.model.half).total
+            ranked = bend_by_few(problem, turned(problem, posed), TURNED)[:TURNED]
+            self.fitted += [fit_from_far(problem, each) for cost, each in ranked if cost < most]
 
     def with_heavier_cloud(self) -> "Trail | None":
         """The same with a cloud that is worth more, where the prior of an elastic solid keeps it from being explained.
