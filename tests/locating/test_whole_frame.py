@@ -345,6 +345,24 @@ def test_each_thing_is_a_region_and_no_plane_is(image: DepthImage, placed: Segme
     assert 3 <= len(masks) <= 8 and max(overlap) > 0.9
 
 
+def test_faces_in_one_plane_and_what_hides_a_part_of_itself_are_regions() -> None:
+    camera = Camera(80, 60, 80.0, 80.0, 40.0, 30.0)
+    depth = np.full((60, 80), 1.0)
+    thing, other = np.s_[20:36, 8:24], np.s_[20:36, 56:72]
+    depth[thing] = depth[other] = 0.8  # as high above the table
+    depth[28:36, 8:24] -= 0.2  # a part of the thing, which hides the rest behind it
+    image = DepthImage(depth, camera)
+    whole = np.zeros(depth.shape, dtype=bool)
+    whole[thing] = True
+    length = 0.4
+    assert off_planes(image, length)[other].all() and off_planes(image, length)[thing].all()
+    assert not off_planes(image, length)[40:].any()
+    masks = regions(image, length, 0.02)
+    assert any((mask == whole).all() for mask in masks)
+    upper = whole & (np.arange(60) < 28)[:, None]
+    assert any((mask == upper).all() for mask in masks)
+
+
 def test_surfaces_end_at_gaps_in_depth() -> None:
     depth = np.ones((4, 6))
     depth[:, 3:] = 1.5

@@ -1,4 +1,4 @@
-"""Regions of a depth image that may be an object: connected surfaces off all planes that are larger than it.
+"""Regions of a depth image that may be an object: connected surfaces off all flat ones that are longer than it.
 
 DepthImage, length of the object -thinned-> DepthImage -regions-> masks, the likeliest first
 """
@@ -26,9 +26,9 @@ PLANE_STD = 6.0
 SIZES = 0.1, 1.3
 """Length of a region, in those of the object: a part of the object, or the object and a rim."""
 
-GAPS = 4.0, 1.0, 0.5, 0.25
-"""Gaps at which surfaces are parted, in that of ``steepest``: the first leaves together what folds over itself; the
-last two are for what is too large."""
+GAPS = 16.0, 4.0, 1.0, 0.25
+"""Gaps at which surfaces are parted, in that of ``steepest``: the first two leave together what hides parts of itself
+or folds over itself; the last is for what is too large (docs/experiments/102.md)."""
 
 SAME = 0.9
 """Share of a region that a part of it is the same from."""
@@ -55,25 +55,37 @@ def steepest(image: DepthImage) -> float:
 
 
 def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
-    """Pixels that are measured, and on no plane that reaches farther than an object of this ``length``."""
-    off = image.valid.copy()
+    """Pixels that are measured, and not of a connected part of a plane that is longer than an object of this ``length``.
+
+    So a face of the object stays, and so does what a table's plane cuts behind the table.
+    """
     camera = image.camera
-    points = camera.directions()[off] * image.depth[off][:, None]
-    left = np.ones(len(points), dtype=bool)
+    points = camera.directions() * image.depth[..., None]
+    pixel = image.depth / min(camera.focal_x_px, camera.focal_y_px)
+    squared = np.where(image.valid, image.depth, np.nan) ** 2
+    off, left = image.valid.copy(), image.valid.copy()
     rng = np.random.default_rng(0)
-    pixel = points[:, 2] / min(camera.focal_x_px, camera.focal_y_px)
     for _ in range(PLANES):
         plane = largest_plane(points[left], pixel[left], rng)
         if plane is None:
             break
-        distance = plane.distance(points)
+        distance = plane.distance(points.reshape(-1, 3)).reshape(pixel.shape)
         near = left & (distance <= pixel)
-        if near.sum() < PLANE_SHARE * len(points) or main_length(points[near]) < SIZES[1] * length:
+        if near.sum() < PLANE_SHARE * image.valid.sum():
             break
-        away = distance / points[:, 2] ** 2  # as the noise of depth cameras grows
-        left &= away > PLANE_STD * np.median(away[near])
-    off[off] = left
+        away = distance / squared  # as the noise of depth cameras grows
+        on = left & (away <= PLANE_STD * np.median(away[near]))
+        left &= ~on
+        for mask in surfaces(image, on, GAPS[1]):
+            is_longer = main_length(points[mask]) >= SIZES[1] * length
+            off &= ~(mask & is_longer)
     return off
+
+
+def surfaces(image: DepthImage, pixels: Bool[np.ndarray, "h w"], gap: float) -> list[Bool[np.ndarray, "h w"]]:
+    """Connected surfaces among some pixels of an image, parted at a gap in that of ``steepest``."""
+    label = connected_pixels(np.where(pixels, image.depth, 0.0), gap * steepest(image))
+    return [pixels & (label == number) for number in np.flatnonzero(np.bincount(label[pixels]) >= MIN_POINTS)]
 
 
 def connected_pixels(depth: Float[np.ndarray, "h w"], step: float) -> Int[np.ndarray, "h w"]:
@@ -102,17 +114,13 @@ def regions(image: DepthImage, length: float, area: float) -> list[Bool[np.ndarr
     parts = list[tuple[float, Bool[np.ndarray, "h w"]]]()
 
     def part(whole: Bool[np.ndarray, "h w"], gaps: tuple[float, ...], size: float) -> None:
-        label = connected_pixels(np.where(whole, image.depth, 0.0), gaps[0] * steepest(image))
-        sizes = np.bincount(label[whole])
-        for number in np.flatnonzero(sizes >= MIN_POINTS):
-            mask = whole & (label == number)
-            longest = 0.0
-            if sizes[number] < SAME * size:
-                longest = main_length(points[mask])
-                if SIZES[0] * length <= longest <= SIZES[1] * length:
-                    parts.append((abs(float(np.log(pixel[mask].sum() / area))), mask))
+        for mask in surfaces(image, whole, gaps[0]):
+            longest = main_length(points[mask])
+            fits = SIZES[0] * length <= longest <= SIZES[1] * length
+            if fits and mask.sum() < SAME * size:
+                parts.append((abs(float(np.log(pixel[mask].sum() / area))), mask))
             if len(gaps) > 1 and (gaps[0] > 1 or longest > SIZES[1] * length):
-                part(mask, gaps[1:], float(sizes[number]))
+                part(mask, gaps[1:], float(mask.sum()) if fits else np.inf)
 
     part(off_planes(image, length), GAPS, np.inf)
     return [mask for _, mask in sorted(parts, key=lambda each: each[0])]
