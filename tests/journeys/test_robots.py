@@ -62,6 +62,11 @@ def gripper(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_gripper(tmp_path_factory.mktemp("robots"))
 
 
+def off_degrees(result: mereo.Result, true: list[float]) -> float:
+    """Largest error of a joint, degrees."""
+    return float(np.rad2deg(np.abs(np.subtract([joint.value for joint in result.joints.values()], true))).max())
+
+
 def write_frame(
     path: Path, scene: Scene, shares: Sequence[float], seed: int, pixels: int = 128, seen_parts: int = 99
 ) -> list[float]:
@@ -417,8 +422,7 @@ def test_the_joints_of_a_real_arm_are_within_a_degree(tmp_path: Path) -> None:
     assert arm.scene is not None
     true = write_frame(tmp_path / "frame.ply", arm.scene, default_rng(2).uniform(0.1, 0.9, 6).tolist(), 2, 192)
     result = mereo.reconstruct(tmp_path / "frame.ply", arm, unit_m=1.0)
-    values = [joint.value for joint in result.joints.values()]
-    assert result.known is True and np.rad2deg(np.abs(np.subtract(values, true))).max() < 1.0
+    assert result.known is True and off_degrees(result, true) < 1.0
 
 
 def test_the_commands_of_the_page_give_the_joints_of_a_gripper(
@@ -681,8 +685,7 @@ def test_a_lamp_of_which_nothing_is_known_is_followed_without_bending(working_fo
         for step in range(4):
             true = write_frame(Path("frame.ply"), lamp.scene, [0.2 + 0.02 * step, 0.7, 0.4 + 0.02 * step], 5)
             result = tracker.follow("frame.ply", 0.1 * step, unit_m=1.0)
-            values = [joint.value for joint in result.joints.values()]
-            assert result.known is True and np.rad2deg(np.abs(np.subtract(values, true))).max() < 1.0
+            assert result.known is True and off_degrees(result, true) < 1.0
             for joint, value in zip(result.joints.values(), true, strict=True):
                 assert joint.interval[0] < value < joint.interval[1]
     assert result.tracking == "followed"
@@ -697,8 +700,7 @@ def test_a_pose_that_is_given_leaves_the_joints_to_be_looked_for(working_folder:
     pose[:3, 3] += 0.01
     result = mereo.reconstruct("frame.ply", lamp, unit_m=1.0, initial_pose=pose)
     assert result.located_by == "pose" and result.known is True
-    values = [joint.value for joint in result.joints.values()]
-    assert np.rad2deg(np.abs(np.subtract(values, true))).max() < 1.0
+    assert off_degrees(result, true) < 1.0
 
 
 def test_a_stream_reads_the_joints_of_each_frame_from_a_folder_or_a_recording(

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 
 import mereo
 from mereo.__main__ import main
+from mereo.fitting.registration.register import Registrar
 from mereo.fitting.tracking import SynchronousExecutor
 from mereo.fitting.uncertainty import radius95
 from mereo.geometry.camera import Camera, DepthImage, SharedNoise
@@ -56,6 +57,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def angle(folder: Path) -> mereo.Object:
     meshes = [str(folder / "long.stl"), str(folder / "short.stl")]
     return mereo.load_object(meshes, units="mm", deformations="rigid")
+
+
+@pytest.fixture(scope="module")
+def registrar(angle: mereo.Object) -> Registrar:
+    made = angle.registrar("auto")
+    assert made is not None
+    return made
 
 
 @pytest.fixture(scope="module")
@@ -119,8 +127,7 @@ def test_an_object_among_others_is_known_at_its_place(
     true = transform_points(PLACED, rest.segments[0].vertices)
     assert_allclose(transform_points(found.pose, long), true, atol=2e-3)
     assert found.seen.cloud.points[:, 2].max() < 0.65, "neither the desk behind it nor the wall is taken for it"
-    spent = found.reconstruction.timings_s
-    assert spent["fit"] == found.seconds, "with the looking, not of the last fit alone"
+    assert found.reconstruction.timings_s["fit"] == found.seconds, "with the looking, not of the last fit alone"
 
 
 def test_the_covariance_of_a_rigid_objects_pose_is_that_of_its_points(found: mereo.Result) -> None:
@@ -165,11 +172,9 @@ def test_each_instance_is_at_its_place_and_has_a_folder(
 
 
 def test_several_instances_are_of_a_whole_frame(placed: SegmentedMesh, angle: mereo.Object) -> None:
-    alone = render_depth(placed, CAMERA)
-    with pytest.raises(ValueError, match="instances is 2, which a whole depth image alone may show"):
-        mereo.reconstruct(alone, angle, unit_m=1.0, instances=2)
-    with pytest.raises(ValueError, match="instances is 0; it must be a whole number, at least 1"):
-        mereo.reconstruct(alone, angle, unit_m=1.0, instances=0)
+    for count, message in ((2, "which a whole depth image alone may show"), (0, "must be a whole number, at least 1")):
+        with pytest.raises(ValueError, match=f"instances is {count}.*{message}"):
+            mereo.reconstruct(render_depth(placed, CAMERA), angle, unit_m=1.0, instances=count)
 
 
 def test_the_command_looks_through_the_frame_and_says_so(
@@ -191,10 +196,8 @@ def test_the_command_looks_through_the_frame_and_says_so(
 
 
 def test_a_mask_or_an_object_alone_is_not_looked_through(
-    image: DepthImage, placed: SegmentedMesh, angle: mereo.Object
+    image: DepthImage, placed: SegmentedMesh, registrar: Registrar
 ) -> None:
-    registrar = angle.registrar("auto")
-    assert registrar is not None
     whole = find_object(mereo.load_frame(image, unit_m=1.0))
     assert is_whole(whole, registrar)
     alone = find_object(mereo.load_frame(render_depth(placed, CAMERA), unit_m=1.0))
@@ -244,14 +247,12 @@ def on_angle(placed: SegmentedMesh) -> tuple[int, int]:
 def looked_at(
     image: DepthImage,
     placed: SegmentedMesh,
-    angle: mereo.Object,
+    registrar: Registrar,
     config: mereo.IsolationConfig,
     outline: Outline = Outline(),  # noqa: B008 (immutable)
 ) -> list[np.ndarray]:
     """Regions that are looked at for the first place, were its outline this one."""
-    registrar = angle.registrar("auto")
     looked = list[np.ndarray]()
-    assert registrar is not None
 
     def look(frame: WholeFrame, mask: np.ndarray) -> Place:
         looked.append(mask)
@@ -266,30 +267,28 @@ def looked_at(
 
 
 def test_only_what_is_seen_at_a_point_is_looked_at(
-    image: DepthImage, placed: SegmentedMesh, angle: mereo.Object, on_angle: tuple[int, int]
+    image: DepthImage, placed: SegmentedMesh, registrar: Registrar, on_angle: tuple[int, int]
 ) -> None:
-    every = looked_at(image, placed, angle, mereo.IsolationConfig())
+    every = looked_at(image, placed, registrar, mereo.IsolationConfig())
     column, row = on_angle
-    at_it = looked_at(image, placed, angle, mereo.IsolationConfig(point=on_angle))
+    at_it = looked_at(image, placed, registrar, mereo.IsolationConfig(point=on_angle))
     assert 0 < len(at_it) < len(every) and all(mask[row - 2 : row + 3, column].any() for mask in at_it)
-    (can,) = looked_at(image, placed, angle, mereo.IsolationConfig(point=CAN))
+    (can,) = looked_at(image, placed, registrar, mereo.IsolationConfig(point=CAN))
     assert can[CAN[1], CAN[0]] and not can[row, column]
-    evident = looked_at(image, placed, angle, mereo.IsolationConfig(), Outline(hits=200))
+    evident = looked_at(image, placed, registrar, mereo.IsolationConfig(), Outline(hits=200))
     assert len(evident) == 1, "the next region is looked at where that is not the object"
 
 
 def test_a_box_is_looked_through_where_it_shows_more_than_the_object(
-    image: DepthImage, placed: SegmentedMesh, angle: mereo.Object
+    image: DepthImage, placed: SegmentedMesh, registrar: Registrar
 ) -> None:
     frame = mereo.load_frame(image, unit_m=1.0)
-    registrar = angle.registrar("auto")
     low, high = placed.bounds
-    assert registrar is not None
     tight = mereo.IsolationConfig(box=(*low, *high))
     for config in (tight, mereo.IsolationConfig(box=BOX, remove_plane=True)):
         assert not is_whole(find_object(frame, config), registrar)
     places = CAMERA.directions() * image.depth[..., None]
-    for mask in (masks := looked_at(image, placed, angle, mereo.IsolationConfig(box=BOX))):
+    for mask in (masks := looked_at(image, placed, registrar, mereo.IsolationConfig(box=BOX))):
         assert (places[mask] >= BOX[:3]).all() and (places[mask] <= BOX[3:]).all()
     assert masks
     with pytest.raises(ValueError, match=f"the point {CAN[0]} {CAN[1]} lies outside .* or more than 5 pixels from any"):
@@ -337,7 +336,8 @@ def test_a_point_that_shows_nothing_is_refused(point: tuple[float, ...], message
 
 
 def test_each_thing_is_a_region_and_no_plane_is(image: DepthImage, placed: SegmentedMesh) -> None:
-    shown = (lambda depth: (depth > 0) & (np.abs(depth - image.depth) < 2e-3))(render_depth(placed, CAMERA).depth)
+    depth = render_depth(placed, CAMERA).depth
+    shown = (depth > 0) & (np.abs(depth - image.depth) < 2e-3)
     off = off_planes(image, 0.12)
     assert off[shown].mean() > 0.95 and off.mean() < 0.2
     masks = regions(image, 0.12, 4e-3)
@@ -346,21 +346,14 @@ def test_each_thing_is_a_region_and_no_plane_is(image: DepthImage, placed: Segme
 
 
 def test_faces_in_one_plane_and_what_hides_a_part_of_itself_are_regions() -> None:
-    camera = Camera(80, 60, 80.0, 80.0, 40.0, 30.0)
-    depth = np.full((60, 80), 1.0)
-    thing, other = np.s_[20:36, 8:24], np.s_[20:36, 56:72]
-    depth[thing] = depth[other] = 0.8  # as high above the table
-    depth[28:36, 8:24] -= 0.2  # a part of the thing, which hides the rest behind it
-    image = DepthImage(depth, camera)
-    whole = np.zeros(depth.shape, dtype=bool)
-    whole[thing] = True
-    length = 0.4
-    assert off_planes(image, length)[other].all() and off_planes(image, length)[thing].all()
-    assert not off_planes(image, length)[40:].any()
-    masks = regions(image, length, 0.02)
-    assert any((mask == whole).all() for mask in masks)
-    upper = whole & (np.arange(60) < 28)[:, None]
-    assert any((mask == upper).all() for mask in masks)
+    depth = np.ones((60, 80))
+    depth[20:36, 8:24] = depth[20:36, 56:72] = 0.8  # as high above the table
+    depth[28:36, 8:24] = 0.6
+    image = DepthImage(depth, Camera(80, 60, 80.0, 80.0, 40.0, 30.0))
+    assert (off_planes(image, 0.4) == (depth < 1)).all()
+    masks = regions(image, 0.4, 0.02)
+    for part in ((depth < 1) & (np.arange(80) < 40), depth == 0.6):
+        assert (masks == part).all(axis=(1, 2)).any()
 
 
 def test_surfaces_end_at_gaps_in_depth() -> None:
@@ -423,8 +416,8 @@ def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
     field = gaussian_filter(rng.normal(size=depth.shape), 8)
     shared = np.where(clean.valid, clean.depth + level * clean.depth * field / field.std(), 0.0)
     noisy = add_depth_noise(DepthImage(shared, clean.camera), std, rng)
-    distance = float(np.median(depth[depth > 0]))
     shown = depth > 0
+    distance = np.median(depth[shown])
     # of single pixels' noise half may pass for shared, as things on the plane widen what is left over
     noise = shared_noise(noisy, shown)
     assert noise.pixel == 1 / CAMERA.focal_x_px

@@ -225,11 +225,16 @@ def columns_of(picture: ndarray) -> list[ndarray]:
     return np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
 
 
+def drawn_errors(path: Path, truth: ndarray, found: ndarray, size: int) -> ndarray:
+    """Picture of the errors of labels, which is written."""
+    error_picture(path, [labelled(truth, found)], size=size)
+    return np.asarray(Image.open(path))
+
+
 def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
     truth, found = two_boxes(), two_boxes()
     found[15:18, 5:15, 5:15], found[5:8, 5:15, 5:15], found[10:12, 5:15, 5:15] = 1, 0, 1
-    error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
-    picture = np.asarray(Image.open(tmp_path / "e.png"))
+    picture = drawn_errors(tmp_path / "e.png", truth, found, 60)
     below = picture[-strips(picture) :]
     assert all(hue_is(below, color).any() for color in (OVER, UNDER, WRONG, EXTRA_OR_MISSING))
     columns = columns_of(picture)
@@ -246,14 +251,12 @@ def test_an_error_on_the_far_side_is_seen_from_behind_only_and_an_empty_predicti
     truth[5:15, 5:15, 5:12] = 1
     found = truth.copy()
     found[7:13, 7:13, 12:16] = 1
-    error_picture(tmp_path / "e.png", [labelled(truth, found)], size=60)
-    picture = np.asarray(Image.open(tmp_path / "e.png"))
+    picture = drawn_errors(tmp_path / "e.png", truth, found, 60)
     columns = columns_of(picture)
     assert [bool(hue_is(columns[k], OVER).sum() > 20) for k in (3, 4)] == [False, True]
     truth = np.zeros((6, 6, 6), np.uint8)
     truth[2:4, 2:4, 2:4] = 1
-    error_picture(tmp_path / "e.png", [labelled(truth, np.zeros_like(truth))], size=40)
-    picture = np.asarray(Image.open(tmp_path / "e.png"))
+    picture = drawn_errors(tmp_path / "e.png", truth, np.zeros_like(truth), 40)
     assert hue_is(picture[: -strips(picture)], UNDER).any()  # all of it is missing
 
 

@@ -26,9 +26,9 @@ PLANE_STD = 6.0
 SIZES = 0.1, 1.3
 """Length of a region, in those of the object: a part of the object, or the object and a rim."""
 
-GAPS = 16.0, 4.0, 1.0, 0.25
-"""Gaps at which surfaces are parted, in that of ``steepest``: the first two leave together what hides parts of itself
-or folds over itself; the last is for what is too large (docs/experiments/102.md)."""
+GAPS = 16.0, 4.0, 1.0
+"""Gaps at which surfaces are parted, in that of ``steepest``: the first leaves together what hides parts of itself, the
+second what folds over itself (docs/experiments/102.md)."""
 
 SAME = 0.9
 """Share of a region that a part of it is the same from."""
@@ -55,14 +55,12 @@ def steepest(image: DepthImage) -> float:
 
 
 def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
-    """Pixels that are measured, and not of a connected part of a plane that is longer than an object of this ``length``.
+    """Pixels that are measured, and of no connected part of a plane that is longer than an object of this ``length``.
 
-    So a face of the object stays, and so does what a table's plane cuts behind the table.
+    So a face of the object stays, and so does what the plane of a table cuts elsewhere.
     """
-    camera = image.camera
-    points = camera.directions() * image.depth[..., None]
-    pixel = image.depth / min(camera.focal_x_px, camera.focal_y_px)
-    squared = np.where(image.valid, image.depth, np.nan) ** 2
+    points = image.camera.directions() * image.depth[..., None]
+    pixel = steepest(image) / STEEPEST * image.depth
     off, left = image.valid.copy(), image.valid.copy()
     rng = np.random.default_rng(0)
     for _ in range(PLANES):
@@ -73,8 +71,8 @@ def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
         near = left & (distance <= pixel)
         if near.sum() < PLANE_SHARE * image.valid.sum():
             break
-        away = distance / squared  # as the noise of depth cameras grows
-        on = left & (away <= PLANE_STD * np.median(away[near]))
+        std = np.median(distance[near] / pixel[near] ** 2) * pixel**2  # as the noise of depth cameras grows
+        on = left & (distance <= PLANE_STD * std)
         left &= ~on
         for mask in surfaces(image, on, GAPS[1]):
             is_longer = main_length(points[mask]) >= SIZES[1] * length
@@ -111,16 +109,16 @@ def regions(image: DepthImage, length: float, area: float) -> list[Bool[np.ndarr
     """
     points = image.camera.directions() * image.depth[..., None]
     pixel = image.depth**2 / (image.camera.focal_x_px * image.camera.focal_y_px)
-    parts = list[tuple[float, Bool[np.ndarray, "h w"]]]()
-
-    def part(whole: Bool[np.ndarray, "h w"], gaps: tuple[float, ...], size: float) -> None:
-        for mask in surfaces(image, whole, gaps[0]):
-            longest = main_length(points[mask])
-            fits = SIZES[0] * length <= longest <= SIZES[1] * length
-            if fits and mask.sum() < SAME * size:
-                parts.append((abs(float(np.log(pixel[mask].sum() / area))), mask))
-            if len(gaps) > 1 and (gaps[0] > 1 or longest > SIZES[1] * length):
-                part(mask, gaps[1:], float(mask.sum()) if fits else np.inf)
-
-    part(off_planes(image, length), GAPS, np.inf)
-    return [mask for _, mask in sorted(parts, key=lambda each: each[0])]
+    masks = list[Bool[np.ndarray, "h w"]]()
+    parts = [(off_planes(image, length), np.inf)]
+    for gap in GAPS:
+        wholes = parts
+        parts = []
+        for whole, size in wholes:
+            for mask in surfaces(image, whole, gap):
+                count = mask.sum()
+                fits = SIZES[0] * length <= main_length(points[mask]) <= SIZES[1] * length
+                if fits and count < SAME * size:
+                    masks.append(mask)
+                parts.append((mask, count if fits else np.inf))
+    return sorted(masks, key=lambda mask: abs(np.log(pixel[mask].sum() / area)))
