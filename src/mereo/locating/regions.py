@@ -5,6 +5,7 @@ DepthImage, length of the object -thinned-> DepthImage -regions-> masks, the lik
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -61,7 +62,8 @@ def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
     """
     points = image.camera.directions() * image.depth[..., None]
     pixel = steepest(image) / STEEPEST * image.depth
-    off, left = image.valid.copy(), image.valid.copy()
+    off = image.valid.copy()
+    left = off.copy()
     rng = np.random.default_rng(0)
     for _ in range(PLANES):
         plane = largest_plane(points[left], pixel[left], rng)
@@ -71,18 +73,16 @@ def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
         near = left & (distance <= pixel)
         if near.sum() < PLANE_SHARE * image.valid.sum():
             break
-        std = np.median(distance[near] / pixel[near] ** 2) * pixel**2  # as the noise of depth cameras grows
-        on = left & (distance <= PLANE_STD * std)
+        most = PLANE_STD * np.median(distance[near] / pixel[near] ** 2)
+        on = left & (distance <= most * pixel**2)  # as the noise of depth cameras grows
         left &= ~on
-        for mask in surfaces(image, on, GAPS[1]):
-            is_longer = main_length(points[mask]) >= SIZES[1] * length
-            off &= ~(mask & is_longer)
+        for mask in parted(on, ndimage.label(on | ~image.valid)[0]):  # what is not measured does not part a plane
+            off &= ~mask | (main_length(points[mask]) < SIZES[1] * length)
     return off
 
 
-def surfaces(image: DepthImage, pixels: Bool[np.ndarray, "h w"], gap: float) -> list[Bool[np.ndarray, "h w"]]:
-    """Connected surfaces among some pixels of an image, parted at a gap in that of ``steepest``."""
-    label = connected_pixels(np.where(pixels, image.depth, 0.0), gap * steepest(image))
+def parted(pixels: Bool[np.ndarray, "h w"], label: Int[np.ndarray, "h w"]) -> list[Bool[np.ndarray, "h w"]]:
+    """Parts of some pixels by their numbers, but for those that are too small for a fit."""
     return [pixels & (label == number) for number in np.flatnonzero(np.bincount(label[pixels]) >= MIN_POINTS)]
 
 
@@ -115,7 +115,7 @@ def regions(image: DepthImage, length: float, area: float) -> list[Bool[np.ndarr
         wholes = parts
         parts = []
         for whole, size in wholes:
-            for mask in surfaces(image, whole, gap):
+            for mask in parted(whole, connected_pixels(np.where(whole, image.depth, 0.0), gap * steepest(image))):
                 count = mask.sum()
                 fits = SIZES[0] * length <= main_length(points[mask]) <= SIZES[1] * length
                 if fits and count < SAME * size:
