@@ -170,10 +170,11 @@ def test_a_segment_that_ran_away_is_refused() -> None:
     after[2, :3, 3] += 4.0  # the peg is 5.6 long
     matches = Matches(np.zeros(1, int), np.zeros(1), 1.0)
     scan = Scan(np.zeros((1, 3)), np.zeros(3), 44.0, 1.0)
+    moved = Registration(after, np.ones(3, bool), np.zeros(3, int), matches)
     with pytest.raises(ValueError, match="segment 'peg' moved by 6.93 .* at most 5.59, .* --hold peg"):
-        _check(object_at_rest(), before, Registration(after, np.ones(3, bool), np.zeros(3, int), matches), scan)
+        _check(object_at_rest(), before, moved, scan)
     after[2, :3, 3] -= 2.0
-    _check(object_at_rest(), before, Registration(after, np.ones(3, bool), np.zeros(3, int), matches), scan)
+    _check(object_at_rest(), before, moved, scan)
 
 
 def test_a_ball_is_shifted_but_not_turned() -> None:

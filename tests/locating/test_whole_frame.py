@@ -172,8 +172,8 @@ def test_each_instance_is_at_its_place_and_has_a_folder(
 
 
 def test_several_instances_are_of_a_whole_frame(placed: SegmentedMesh, angle: mereo.Object) -> None:
-    for count, message in ((2, "which a whole depth image alone may show"), (0, "must be a whole number, at least 1")):
-        with pytest.raises(ValueError, match=f"instances is {count}.*{message}"):
+    for count, message in ((2, ", which a whole depth image alone"), (0, "; it must be a whole number, at least 1")):
+        with pytest.raises(ValueError, match=f"instances is {count}{message}"):
             mereo.reconstruct(render_depth(placed, CAMERA), angle, unit_m=1.0, instances=count)
 
 
@@ -283,8 +283,7 @@ def test_a_box_is_looked_through_where_it_shows_more_than_the_object(
     image: DepthImage, placed: SegmentedMesh, registrar: Registrar
 ) -> None:
     frame = mereo.load_frame(image, unit_m=1.0)
-    low, high = placed.bounds
-    tight = mereo.IsolationConfig(box=(*low, *high))
+    tight = mereo.IsolationConfig(box=(*placed.bounds.ravel(),))
     for config in (tight, mereo.IsolationConfig(box=BOX, remove_plane=True)):
         assert not is_whole(find_object(frame, config), registrar)
     places = CAMERA.directions() * image.depth[..., None]
@@ -349,10 +348,12 @@ def test_faces_in_one_plane_and_what_hides_a_part_of_itself_are_regions() -> Non
     depth = np.ones((60, 80))
     depth[20:36, 8:24] = depth[20:36, 56:72] = 0.8  # as high above the table
     depth[28:36, 8:24] = 0.6
+    depth[40::3] = depth[40:, ::3] = 0.0  # not measured, but no end of the table
     image = DepthImage(depth, Camera(80, 60, 80.0, 80.0, 40.0, 30.0))
-    assert (off_planes(image, 0.4) == (depth < 1)).all()
+    things = np.isin(depth, (0.6, 0.8))
+    assert (off_planes(image, 0.4) == things).all()
     masks = regions(image, 0.4, 0.02)
-    for part in ((depth < 1) & (np.arange(80) < 40), depth == 0.6):
+    for part in (things & (np.arange(80) < 40), depth == 0.6):
         assert (masks == part).all(axis=(1, 2)).any()
 
 
