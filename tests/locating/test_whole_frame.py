@@ -355,6 +355,8 @@ def test_faces_in_one_plane_and_what_hides_a_part_of_itself_are_regions() -> Non
     masks = regions(image, 0.4, 0.02)
     for part in (things & (np.arange(80) < 40), depth == 0.6):
         assert (masks == part).all(axis=(1, 2)).any()
+    seen = find_object(mereo.load_frame(image), mereo.IsolationConfig(point=(12, 30)))
+    assert len(at_point(seen, None).cloud) == 128, "the nearer half alone"
 
 
 def test_surfaces_end_at_gaps_in_depth() -> None:

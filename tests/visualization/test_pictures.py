@@ -72,7 +72,8 @@ def hue_is(pixels: ndarray, color: Color) -> ndarray:
 
 
 def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
-    view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), *FRONT, margin=1.25)
+    box = np.array([[-1.0, -1, 4], [1, 1, 6]])
+    view = Viewpoint.along(box, *FRONT, margin=1.25)
     canvas = Canvas.empty(view, (80, 60))
     canvas.draw_triangles(Triangles.of(SegmentedMesh((ball((0, 0, 5), 1.0),))))
     seen = np.isfinite(canvas.depth)
@@ -83,7 +84,7 @@ def test_an_orthographic_ball_has_its_closed_form_depth_and_area() -> None:
     inner = x**2 + y**2 < 0.9
     # depth in the view frame, whose origin is the middle of the box
     assert_allclose(canvas.depth[seen][inner], -np.sqrt(1 - x**2 - y**2)[inner], atol=6e-3)
-    view = Viewpoint.along(np.array([[-1.0, -1, 4], [1, 1, 6]]), (0.0, 0.0, 2.0), (0.0, 0.0, 1.0))
+    view = Viewpoint.along(box, (0.0, 0.0, 2.0), (0.0, 0.0, 1.0))
     rotation = view.T_view_world[:3, :3]
     assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
     assert_allclose(rotation[2], [0, 0, 1])
@@ -102,13 +103,15 @@ def test_a_pinhole_picture_is_the_camera_depth_image_in_colour() -> None:
 
 def test_nearer_things_hide_farther_ones() -> None:
     near, far = ball((0, 0, 0), 0.5, (255, 0, 0)), ball((0, 0, 3), 1.0, (0, 0, 255), "far")
-    view = Viewpoint.along(np.array([[-1.0, -1, -1], [1, 1, 4]]), *FRONT)
-    picture = shade(SegmentedMesh((far, near)), view, (60, 60))
+    box = np.array([[-1.0, -1, -1], [1, 1, 4]])
+    view = Viewpoint.along(box, *FRONT)
+    both = SegmentedMesh((far, near))
+    picture = shade(both, view, (60, 60))
     assert hue_is(picture[30, 30], (255, 0, 0))
     assert hue_is(picture[30, 8], (0, 0, 255))
-    behind = Viewpoint.along(np.array([[-1.0, -1, -1], [1, 1, 4]]), (0.0, 0.0, -1.0), (0.0, -1.0, 0.0))
-    assert not hue_is(shade(SegmentedMesh((far, near)), behind, (60, 60)), (255, 0, 0)).any()
-    recolored = shade(SegmentedMesh((far, near)), view, (60, 60), colors=[(0, 255, 0), (0, 255, 0)])
+    behind = Viewpoint.along(box, (0.0, 0.0, -1.0), (0.0, -1.0, 0.0))
+    assert not hue_is(shade(both, behind, (60, 60)), (255, 0, 0)).any()
+    recolored = shade(both, view, (60, 60), colors=[(0, 255, 0), (0, 255, 0)])
     assert hue_is(recolored[30, 30], (0, 255, 0))
 
 
@@ -225,8 +228,9 @@ def columns_of(picture: ndarray) -> list[ndarray]:
     return np.array_split(picture[: -strips(picture), 12:], 8, axis=1)
 
 
-def drawn_errors(path: Path, truth: ndarray, found: ndarray, size: int) -> ndarray:
-    """Picture of the errors of labels, which is written."""
+def drawn_errors(folder: Path, truth: ndarray, found: ndarray, size: int) -> ndarray:
+    """Picture of the errors of labels, which is written into a folder."""
+    path = folder / "e.png"
     error_picture(path, [labelled(truth, found)], size=size)
     return np.asarray(Image.open(path))
 
@@ -234,7 +238,7 @@ def drawn_errors(path: Path, truth: ndarray, found: ndarray, size: int) -> ndarr
 def test_the_error_picture_shows_each_error_in_its_column_only(tmp_path: Path) -> None:
     truth, found = two_boxes(), two_boxes()
     found[15:18, 5:15, 5:15], found[5:8, 5:15, 5:15], found[10:12, 5:15, 5:15] = 1, 0, 1
-    picture = drawn_errors(tmp_path / "e.png", truth, found, 60)
+    picture = drawn_errors(tmp_path, truth, found, 60)
     below = picture[-strips(picture) :]
     assert all(hue_is(below, color).any() for color in (OVER, UNDER, WRONG, EXTRA_OR_MISSING))
     columns = columns_of(picture)
@@ -251,12 +255,12 @@ def test_an_error_on_the_far_side_is_seen_from_behind_only_and_an_empty_predicti
     truth[5:15, 5:15, 5:12] = 1
     found = truth.copy()
     found[7:13, 7:13, 12:16] = 1
-    picture = drawn_errors(tmp_path / "e.png", truth, found, 60)
+    picture = drawn_errors(tmp_path, truth, found, 60)
     columns = columns_of(picture)
     assert [bool(hue_is(columns[k], OVER).sum() > 20) for k in (3, 4)] == [False, True]
     truth = np.zeros((6, 6, 6), np.uint8)
     truth[2:4, 2:4, 2:4] = 1
-    picture = drawn_errors(tmp_path / "e.png", truth, np.zeros_like(truth), 40)
+    picture = drawn_errors(tmp_path, truth, np.zeros_like(truth), 40)
     assert hue_is(picture[: -strips(picture)], UNDER).any()  # all of it is missing
 
 

@@ -74,6 +74,11 @@ class Camera:
         if not (np.isfinite(self.center_x_px) and np.isfinite(self.center_y_px)):
             raise ValueError("the principal point is not finite; check the intrinsics file")
 
+    @property
+    def focal_px(self) -> float:
+        """The shorter focal length, by which a pixel is as wide as it is anywhere, in pixels."""
+        return min(self.focal_x_px, self.focal_y_px)
+
     @classmethod
     def from_fov(cls, width: int, height: int, fov_rad: float) -> "Camera":
         """Camera of square pixels, principal point in the middle, ``fov_rad`` the full horizontal angle of view."""

@@ -56,7 +56,6 @@ class Jumps(NamedTuple):
     def of(cls, image: DepthImage, length: float) -> "Jumps":
         """Jumps of an image, by more than a slope or noise explains; an object of this ``length`` stands on planes."""
         depth = image.depth
-        focal = min(image.camera.focal_x_px, image.camera.focal_y_px)
         noise = noise_of_differences(second_differences(depth, 1), second_differences(depth.T, 1))
         step = np.maximum(steepest(image) * depth, NOISE_STD * noise * depth**2)
         rows = _along_rows(depth, step)
@@ -67,7 +66,7 @@ class Jumps(NamedTuple):
         least = CREASE_STD * np.sqrt(6.0) * noise_of_differences(*second)
         sharpest = np.fmax(*(np.abs(part) for part in second))
         # a crease of a right angle changes inverse depth by so much
-        creased = (np.nan_to_num(sharpest) > least) | (lag / focal < least * depth)
+        creased = (np.nan_to_num(sharpest) > least) | (lag / image.camera.focal_px < least * depth)
         planes = image.valid & ~off_planes(image, length)
         creased, planes = (
             ndimage.maximum_filter(each, 2 * reach + 1) for each, reach in ((creased, EDGE_OFF), (planes, lag))

@@ -27,9 +27,12 @@ PLANE_STD = 6.0
 SIZES = 0.1, 1.3
 """Length of a region, in those of the object: a part of the object, or the object and a rim."""
 
-GAPS = 16.0, 4.0, 1.0
-"""Gaps at which surfaces are parted, in that of ``steepest``: the first leaves together what hides parts of itself, the
-second what folds over itself (docs/experiments/102.md)."""
+FOLD = 4.0
+"""Gap, in that of ``steepest``, up to which a surface that folds over itself goes on."""
+
+GAPS = 16.0, FOLD, 1.0
+"""Gaps at which surfaces are parted, in the same: the first leaves together what hides parts of itself
+(docs/experiments/102.md)."""
 
 SAME = 0.9
 """Share of a region that a part of it is the same from."""
@@ -38,8 +41,7 @@ SAME = 0.9
 def thinned(image: DepthImage, length: float) -> tuple[DepthImage, int]:
     """Every so many pixels of an image, where an object of this ``length`` has more than ``ACROSS``; and how many."""
     camera = image.camera
-    focal = min(camera.focal_x_px, camera.focal_y_px)
-    every = max(1, round(length * focal / float(np.median(image.depth[image.valid])) / ACROSS))
+    every = max(1, round(length * camera.focal_px / float(np.median(image.depth[image.valid])) / ACROSS))
     if every == 1:
         return image, 1
     first = every // 2
@@ -52,7 +54,7 @@ def thinned(image: DepthImage, length: float) -> tuple[DepthImage, int]:
 
 def steepest(image: DepthImage) -> float:
     """Gap in depth between neighbouring pixels, as a share of it, from which on there are two surfaces."""
-    return STEEPEST / min(image.camera.focal_x_px, image.camera.focal_y_px)
+    return STEEPEST / image.camera.focal_px
 
 
 def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
@@ -61,7 +63,7 @@ def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
     So a face of the object stays, and so does what the plane of a table cuts elsewhere.
     """
     points = image.camera.directions() * image.depth[..., None]
-    pixel = steepest(image) / STEEPEST * image.depth
+    pixel = image.depth / image.camera.focal_px
     off = image.valid.copy()
     left = off.copy()
     rng = np.random.default_rng(0)

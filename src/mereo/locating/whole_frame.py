@@ -35,7 +35,7 @@ from mereo.io.bounds import Cells, Instances, check_value
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.locating.outline import Jumps, Outline, compare_outline
-from mereo.locating.regions import GAPS, SIZES, connected_pixels, regions, steepest, thinned
+from mereo.locating.regions import FOLD, SIZES, connected_pixels, regions, steepest, thinned
 from mereo.models.trained import Trained
 from mereo.reconstruction.isolation import IsolationStep, Reading, Selection
 from mereo.reconstruction.observation import HOLE_PX, Observation
@@ -304,7 +304,7 @@ def at_point(seen: Observation, registrar: Registrar | None) -> Observation:
     if seen.point is None or seen.frame.depth is None or (registrar is not None and is_whole(seen, registrar)):
         return seen
     image, (column, row) = seen.frame.depth, seen.point
-    label = connected_pixels(np.where(seen.kept_pixels(), image.depth, 0.0), GAPS[0] * steepest(image))
+    label = connected_pixels(np.where(seen.kept_pixels(), image.depth, 0.0), FOLD * steepest(image))
     return replace(part_of(seen, label == label[row, column], "point", "the connected surface at it"), point=None)
 
 

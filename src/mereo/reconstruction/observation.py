@@ -522,7 +522,7 @@ def shared_noise(whole: DepthImage, shown: PixelMask) -> SharedNoise:
     places = terms(some)
     inverse = 1.0 / depth.ravel()[some]
     points = whole.camera.unproject(width * places[:, :2] + 0.5, 1.0 / inverse)
-    focal_px = min(whole.camera.focal_x_px, whole.camera.focal_y_px)
+    focal_px = whole.camera.focal_px
     pixel = points[:, 2] / focal_px
     plane = largest_plane(points, pixel, default_rng(0))
     if plane is None:
