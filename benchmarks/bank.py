@@ -406,6 +406,7 @@ def answer_facts(
     if fit is None:
         return facts
     facts |= {"method": fit.method, "explained": fit.explained, "accepted": fit.accepted, "residual": fit.residual}
+    facts["expected_iou"] = fit.expected_iou
     if truth is None or material is None:
         return facts
     facts["iou"], facts["miou"] = scored(truth, fit.model, fit.material / factor)
@@ -413,11 +414,10 @@ def answer_facts(
     seen = seen_points(positions, PointCloud(transform_points(answer.T_camera_input, frame.seen.cloud.points)), factor)
     errors = RegistrationErrors.of(fit, positions, seen, factor)
     assert fit.uncertainty is not None
-    radii = np.sqrt(errors.gaussian**2 + errors.other**2) + errors.reach
     for name, which in (("seen", seen), ("hidden", ~seen)):
         if which.any():
             inside = float((errors.ratios[which] <= 1.0).mean())
-            facts[name] = [inside, float(np.median(errors.distances[which])), float(np.median(radii[which]))]
+            facts[name] = [inside, float(np.median(errors.distances[which])), float(np.median(errors.radii[which]))]
     return facts
 
 

@@ -45,7 +45,7 @@ FILES = (
     "geometry/surface_patches.py",
 )
 
-NO_MEASURE = ("STATES_SEED", "HELD", "POSE", "TO_STD", "BLOCK", "TrackConfig", "Answer.resolution")
+NO_MEASURE = ("STATES_SEED", "HELD", "POSE", "BLOCK", "TrackConfig", "Answer.resolution")
 """What is no tuned number (a seed, a layout, a unit, a size of a block of work), an option, or of sequences alone."""
 
 LEAST_CHANGE = 0.002

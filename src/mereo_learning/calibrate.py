@@ -214,7 +214,7 @@ class MeasuredRadii:
     def of(cls, view: CalibrationView, candidate: Candidate, registration: Registration) -> "MeasuredRadii":
         """Measurement of a registration that was made of a candidate, by weights that are not calibrated."""
         truth = nearest_truth(registration.model, registration.material, view.material(registration.model))
-        raw = replace(registration, radius_scale=1.0, extra_radius=0.0)
+        raw = replace(registration, radius_scale=1.0)
         errors = RegistrationErrors.of(raw, truth, seen_points(truth, view.seen, 1.0), 1.0)
         assert registration.optimum is not None and candidate.modes is not None
         return cls(errors, candidate.modes.problem.cloud_misfit(registration.optimum.surface))

@@ -114,7 +114,7 @@ class RegistrationErrors:
         ratios: factor of the posterior's Gaussian radius with which the true position lies on the rim of the whole one;
             0 where it lies within in any case.
         gaussian: these radii, scene units.
-        other: radii of the other parts, whose squares add: ``RadiusParts.open``, ``Uncertainty.extra_radius``.
+        open: ``RadiusParts.open``, whose squares are added.
         reach: ``RadiusParts.reach``, which is added to all.
         seen: which of the points the cloud shows.
         calibrated: whether the radii are.
@@ -123,7 +123,7 @@ class RegistrationErrors:
     distances: Float[np.ndarray, " n"]
     ratios: Float[np.ndarray, " n"]
     gaussian: Float[np.ndarray, " n"]
-    other: Float[np.ndarray, " n"]
+    open: Float[np.ndarray, " n"]
     reach: Float[np.ndarray, " n"]
     seen: Bool[np.ndarray, " n"]
     calibrated: bool = False
@@ -154,27 +154,24 @@ class RegistrationErrors:
         unit = sure.optimum.unit / registration.scene_unit
         distances = np.linalg.norm(registration.material[:count] - truth, axis=1)
         off = distances / registration.scene_unit
-        gaussian, other, reach = (
-            unit * part[:count]
-            for part in (sure.parts.gaussian, np.hypot(sure.parts.open, sure.extra_radius), sure.parts.reach)
+        gaussian, open, reach = (
+            unit * part[:count] for part in (sure.parts.gaussian, sure.parts.open, sure.parts.reach)
         )
-        ratios = np.sqrt(np.maximum(np.maximum(off - reach, 0.0) ** 2 - other**2, 0.0)) / gaussian
-        errors = cls(
-            distances / scene_unit, ratios, gaussian, other, reach, seen, registration.radius_scale is not None
-        )
+        ratios = np.sqrt(np.maximum(np.maximum(off - reach, 0.0) ** 2 - open**2, 0.0)) / gaussian
+        errors = cls(distances / scene_unit, ratios, gaussian, open, reach, seen, registration.radius_scale is not None)
         return errors.scaled(sure.factor)
 
     @classmethod
     def together(cls, each: Sequence["RegistrationErrors"]) -> "RegistrationErrors":
         """Errors of several views, every point counted once; calibrated where all of them are."""
-        names = ("distances", "ratios", "gaussian", "other", "reach", "seen")
+        names = ("distances", "ratios", "gaussian", "open", "reach", "seen")
         columns = {name: np.concatenate([getattr(view, name) for view in each]) for name in names}
         return cls(**columns, calibrated=all(view.calibrated for view in each))
 
     @property
     def radii(self) -> Float[np.ndarray, " n"]:
         """Radii of all points, scene units."""
-        return RadiusParts(self.gaussian, self.other, self.reach).radii()
+        return RadiusParts(self.gaussian, self.open, self.reach).radii()
 
     def scale(self) -> float:
         """Factor of the Gaussian's radii that holds 95 % of the true positions: ``Calibration.radius_scale``."""

@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from answers import fit_cloud, fit_modes
-from fit_cases import IN_FRONT, SCENE, seen, shown, true_material
+from fit_cases import IN_FRONT, SCENE, seen, shown
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -33,6 +33,7 @@ from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
+from mereo_learning.scoring import true_material
 
 CLEAN = replace(GenerateConfig(), noise_std=0.0)
 
@@ -44,18 +45,18 @@ def view() -> View:
 
 @pytest.fixture(scope="module")
 def registration(model: StatisticalModel, view: View) -> Registration:
-    return fit_cloud(view.depth.to_points().points, model, true_material(model, view))
+    return fit_cloud(view.depth.to_points().points, model, true_material(view, model))
 
 
 @pytest.mark.parametrize(("index", "method"), [*((index, "modes") for index in range(4)), (1, "draws")])
 def test_a_known_state_is_found(model: StatisticalModel, index: int, method: str) -> None:
     view = sample_view(SCENE, CLEAN, example_rng(5, index))
-    fitted = fit_modes(view.depth.to_points().points, model, 1.0, true_material(model, view))
+    fitted = fit_modes(view.depth.to_points().points, model, 1.0, true_material(view, model))
     found = fitted.registration
     if method == "draws":
         found = fitted.with_draws(DrawnStates.of(SCENE, model, 100, 1000))
     assert found.method == method
-    assert np.median(norm(found.material - true_material(model, view), axis=1)) < 0.05
+    assert np.median(norm(found.material - true_material(view, model), axis=1)) < 0.05
     assert found.accepted and found.explained > 0.99 and found.beyond_states < 0.05
 
 
@@ -64,7 +65,7 @@ def test_what_the_frame_rules_out_is_told(model: StatisticalModel, view: View, r
     points = view.depth.to_points().points
     left = points[points[:, 0] < np.median(points[:, 0])]
     past = replace(UNDECIDED, other_lines="past")
-    half = fit_modes(left, model, 1.0, true_material(model, view), past).registration
+    half = fit_modes(left, model, 1.0, true_material(view, model), past).registration
     assert half.ruled_out is not None and half.ruled_out > 0.1
     said = recognize(half)
     assert said.known is not True and said.reason is not None

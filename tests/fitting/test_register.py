@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from analytic import untrained
 from answers import answer_to, reconstruct
-from fit_cases import true_material
 from folder_contents import read_json
 from numpy.testing import assert_allclose, assert_array_equal
 from trimesh.remesh import subdivide
@@ -46,7 +45,7 @@ from mereo.synthesis.config import GenerateConfig
 from mereo.synthesis.examples import View, sample_view
 from mereo.synthesis.sample_views import SampleView, load_view
 from mereo_learning.cases import Evaluation, RegistrationErrors, seen_points
-from mereo_learning.scoring import EvaluationConfig, evaluate
+from mereo_learning.scoring import EvaluationConfig, evaluate, true_material
 from mereo_learning.tables import markdown_table, metrics
 
 
@@ -227,7 +226,7 @@ def engine_view() -> View:
 
 def test_a_registration_is_as_far_off_as_its_points_are(engine: Model, engine_view: View) -> None:
     statistical = engine.statistical_model
-    truth = true_material(statistical, engine_view)
+    truth = true_material(engine_view, statistical)
     cloud = engine_view.depth.to_points()
     found = search_modes(CloudToFit(cloud.points, scene_unit=1.0), statistical).registration
     shown = seen_points(truth, cloud, 1.0)

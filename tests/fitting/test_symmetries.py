@@ -137,15 +137,12 @@ def test_radii_hold_what_is_left_open() -> None:
     parts = replace(without, open=turns).radii()
     radii = parts.radii()
     assert_allclose(parts.gaussian, alone.gaussian)
-    assert not alone.open.any()
     wheel = model.labels == 2
     assert_allclose(radii[~wheel], alone.radii()[~wheel])
     rim = wheel & (norm(model.rest_points[:, :2], axis=1) > 5.5)
     assert radii[rim].min() > 8.0 and radii[rim].max() < 20.0
-    follow = model.weights(model.rest_points[:5], model.labels[:5])
-    assert_allclose(replace(without, open=turns).radii(follow).radii(), radii[:5], rtol=0.2)
     assert_allclose(parts.radii(1e-9)[rim], parts.open[rim])  # how far a turn goes no calibration scales
-    assert_allclose(parts.radii(2.0, 3.0) ** 2, 4 * parts.gaussian**2 + parts.open**2 + 9)
+    assert_allclose(parts.radii(2.0) ** 2, 4 * parts.gaussian**2 + parts.open**2)
 
 
 def test_a_covariance_that_rounding_has_spoilt_is_as_unsure_as_rounding_tells() -> None:

@@ -7,12 +7,10 @@ from toy_scene import Lift, Shear, toy_scene
 
 from mereo.geometry.camera import Camera
 from mereo.geometry.mesh import SegmentedMesh
-from mereo.geometry.transforms import inverse_rigid, rigid, transform_points
+from mereo.geometry.transforms import rigid, transform_points
 from mereo.scenes.random_states import state_points
-from mereo.scenes.scene import State
 from mereo.scenes.statistical_model import StatisticalModel
 from mereo.synthesis.depth_sensor import render_depth
-from mereo.synthesis.examples import View
 
 SCENE = toy_scene()
 
@@ -24,13 +22,6 @@ IN_FRONT = rigid(Rotation.from_euler("xyz", [25, 30, 10], degrees=True).as_matri
 def seen(mesh: SegmentedMesh) -> ndarray:
     """Cloud of a noiseless depth image, from the origin along z."""
     return render_depth(mesh, Camera.from_fov(128, 128, 0.6)).to_points().points
-
-
-def true_material(model: StatisticalModel, view: View) -> ndarray:
-    """Material points of a view's state, camera frame."""
-    state = State(view.mesh.transformed(view.T_world_camera), view.deformations)
-    points = state_points(state, model.nodes, model.node_labels)
-    return transform_points(inverse_rigid(view.T_world_camera), points)
 
 
 def shown(model: StatisticalModel, excess: float) -> tuple[ndarray, ndarray]:

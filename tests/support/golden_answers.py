@@ -41,7 +41,6 @@ from numpy.random import default_rng
 import mereo
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.metrics import grid_confusion, intersection_over_union, labels_on, truth_grid
-from mereo.geometry.transforms import fit_rigid
 from mereo.io.atomic_files import JsonObject
 from mereo.models.weights_place import shipped_names
 from mereo.scenes.scene import Scene
@@ -128,20 +127,16 @@ def facts_of(name: str, frame: Frame) -> JsonObject:
     }
     if registration is None:
         return facts
-    rest = registration.model.rest_points
-    material, scene_unit = registration.material, registration.scene_unit
+    material, sure = registration.material, registration.uncertainty
     rows = np.linspace(0, len(material) - 1, POSITIONS).astype(int)
-    sure = registration.uncertainty
-    radii = None if sure is None else np.concatenate(sure.radii(material).vertices)
+    assert sure is not None
     return facts | {
         "explained": round(registration.explained, 4),
         "believed": registration.accepted,
-        "ruled_out": None if registration.ruled_out is None else round(registration.ruled_out, 4),
-        "scene_unit": significant(scene_unit),
+        "ruled_out": round(registration.ruled_out or 0.0, 4),
+        "scene_unit": significant(registration.scene_unit),
         "unit_known": registration.unit_known,
-        "radius95": None if radii is None else [significant(value) for value in np.quantile(radii, (0.5, 0.95))],
-        "state": [round(float(value), 3) for value in registration.z[:12]],
-        "pose": [[round(float(value), 5) for value in row] for row in fit_rigid(scene_unit * rest, material)[:3]],
+        "radius95": [significant(value) for value in np.quantile(np.concatenate(sure.vertices), (0.5, 0.95))],
         "size": significant(float(np.ptp(material, axis=0).max())),
         "positions": [[significant(value) for value in row] for row in material[rows]],
         "material": digest(material),

@@ -31,7 +31,7 @@ from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.registration.registration import Registration
 from mereo.geometry.camera import PointCloud
-from mereo.geometry.conventions import Facts, Names, WholeNumbers
+from mereo.geometry.conventions import Names, WholeNumbers
 from mereo.geometry.labels import LabelGrid
 from mereo.geometry.mesh import EMPTY_MESH, Segment, SegmentedMesh
 from mereo.geometry.transforms import Vector, checked_pose, inverse_rigid, rigid, transform_points
@@ -93,6 +93,7 @@ class SegmentResult:
             without a network.
         error_radius: radius around the centroid that holds the true one with probability 0.95; None where the answer
             is the network's.
+        expected_iou: intersection over union of its volume with the true one, as it may be expected; None likewise.
         pose: best rigid motion from the object's own files to the frame, as ``Result.pose``; of a link of a robot's
             file, the pose of its frame there; None likewise.
         poses: of all segments, by their names; empty where the answer is the network's.
@@ -105,6 +106,7 @@ class SegmentResult:
     volume: float
     confidence: float
     error_radius: float | None
+    expected_iou: float | None
     pose: Pose | None
     poses: Mapping[str, Pose] = field(default_factory=dict)
 
@@ -397,6 +399,11 @@ class Result(Answer, SegmentedResult):
         return None if self.registered is None else self.registered.residual
 
     @property
+    def expected_iou(self) -> float | None:
+        """Intersection over union of its volume with the true one, as it may be expected; None without a fit."""
+        return None if self.registered is None else self.registered.expected_iou
+
+    @property
     def joints(self) -> JointValues:
         """Value of each joint that the object's definition has by name, as a robot's file has; empty without a fit."""
         return measure_joints(self)
@@ -410,8 +417,8 @@ class Result(Answer, SegmentedResult):
     def _segments(self) -> SegmentResults:
         fit, parts = self.registered, self.reconstruction.segments
         sure = None if fit is None else fit.uncertainty
-        radii = {} if sure is None else {segment.name: segment.centroid_radius95 for segment in sure.segments}
-        return _segment_results(parts, self.surfaces, radii, {} if fit is None else segment_poses(fit))
+        of_segments = {} if sure is None else {segment.name: segment for segment in sure.segments}
+        return _segment_results(parts, self.surfaces, of_segments, {} if fit is None else segment_poses(fit))
 
     def to_dict(self) -> JsonObject:
         """Figures as in ``summary.json``, in plain types: numbers, texts, lists, None for NaN.
@@ -611,9 +618,9 @@ def registration_of(answer: Answer) -> Registration:
 
 
 def _segment_results(
-    parts: Iterable[Any], surfaces: SegmentedMesh, radii: Facts, poses: Mapping[str, Pose]
+    parts: Iterable[Any], surfaces: SegmentedMesh, sure: Mapping[str, Any], poses: Mapping[str, Pose]
 ) -> SegmentResults:
-    """Segments by their names, of figures as ``SegmentFacts`` has them; radii and poses are those that are known."""
+    """Segments by their names, of figures as ``SegmentFacts`` has them; radii and IoUs by ``sure``, where known."""
     return {
         part.name: SegmentResult(
             part.name,
@@ -622,7 +629,8 @@ def _segment_results(
             _numbers(part.centroid),
             part.volume,
             float(_numbers([part.confidence])[0]),
-            radii.get(part.name),
+            getattr(sure.get(part.name), "centroid_radius95", None),
+            getattr(sure.get(part.name), "expected_iou", None),
             poses.get(part.name),
             poses,
         )
@@ -649,9 +657,9 @@ def _fact(*keys: str, read: Callable[[Any], Any] = lambda value: value) -> Any:
 class StoredResult(SegmentedResult):
     """Result as a folder or a pickle has it: values in the axes and unit that it was in, and nothing that computes.
 
-    ``unit_m``, ``known``, ``explained``, ``residual``, ``model_scale``, ``pose``, ``covariance`` and ``joints`` are as
-    of ``Result``, and so are ``transformed``, ``save``, without what needs the observed points or the radii of single
-    ones, and ``carry``, where ``load_result`` was given the object.
+    ``unit_m``, ``known``, ``explained``, ``residual``, ``expected_iou``, ``model_scale``, ``pose``, ``covariance`` and
+    ``joints`` are as of ``Result``, and so are ``transformed``, ``save``, without what needs the observed points or the
+    radii of single ones, and ``carry``, where ``load_result`` was given the object.
 
     Attributes:
         facts: content of ``summary.json``.
@@ -673,6 +681,7 @@ class StoredResult(SegmentedResult):
 
     unit_m, known, model_scale = _fact("unit_m"), _fact("recognition", "known"), _fact("model_scale")
     explained, residual = _fact("registration", "explained"), _fact("registration", "residual")
+    expected_iou = _fact("registration", "expected_iou")
     pose, covariance = _fact("pose", read=_numbers), _fact("pose_covariance", read=_numbers)
 
     @property
@@ -688,11 +697,11 @@ class StoredResult(SegmentedResult):
     @cached_property
     def _segments(self) -> SegmentResults:
         rows = self.facts["segments"]
-        radii = {row["name"]: row.get("centroid_radius95") for row in rows}
+        parts = {row["name"]: SimpleNamespace(**row) for row in rows}
         poses = {row["name"]: np.array(row["pose"]) for row in rows if "pose" in row}
         if self.surfaces is None:
             return {}
-        return _segment_results((SimpleNamespace(**row) for row in rows), self.surfaces, radii, poses)
+        return _segment_results(parts.values(), self.surfaces, parts, poses)
 
     def to_dict(self) -> JsonObject:
         """As ``Result.to_dict``."""

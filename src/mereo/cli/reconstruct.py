@@ -48,7 +48,7 @@ from mereo.models.trained import Trained
 from mereo.reconstruction.observation import FrameWarning, find_object
 from mereo.results.carry import Placed, carry, place
 from mereo.scenes.registry import files_of
-from mereo.visualization.reconstruction_report import confidence_title, radius_words, trust
+from mereo.visualization.reconstruction_report import confidence_title, iou_words, radius_words, trust
 from mereo.visualization.result_files import INSTANCE, summary_of, write_answer
 from mereo.visualization.units import Unit
 from mereo.workers.spread import Cluster, choose_cluster, spread
@@ -452,6 +452,7 @@ def print_uncertainty(registered: Registration | None, unit: Unit) -> None:
     if registered is None or registered.uncertainty is None:
         return
     print(radius_words(registered.uncertainty.summary(), unit))
+    print(iou_words(registered.uncertainty.expected_iou))
 
 
 def print_segments(result: Result) -> None:

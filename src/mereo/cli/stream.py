@@ -530,7 +530,7 @@ class FrameAnswer:
             facts["radius95"] = sure.summary(sure.outline)
             for each in sure.segments if uncertainty else ():
                 sure_of = {"centroid_radius95": round(each.centroid_radius95, DIGITS), "volume95": each.volume95}
-                segments[each.name] |= sure_of
+                segments[each.name] |= {**sure_of, "expected_iou": round(each.expected_iou, 3)}
         return cls(mesh, {**facts, "strays": strays, "segments": segments})
 
 

@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Int, UInt8
+from jaxtyping import Float, Float32, UInt8
 from scipy.linalg import eigh
 from scipy.stats import chi2, norm
 
@@ -29,8 +29,8 @@ from mereo.fitting.problem.segments import left_open
 from mereo.geometry.brief import counted
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.radii import Radii
-from mereo.geometry.solids import owned_gradients
-from mereo.geometry.transforms import transform_points
+from mereo.geometry.solids import moment_gradients, owned_gradients
+from mereo.geometry.transforms import Indices, Points, Values, Vector, transform_points
 from mereo.io.cores import limit_blas_threads
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -42,20 +42,19 @@ LEVEL = 0.95
 WITHIN = float(norm.interval(LEVEL)[1])
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
+MEAN_ABSOLUTE = float(norm.expect(np.abs))
+"""Mean size of a standard normal number: the root of 2 over pi."""
+
 UNCALIBRATED = 1.25
 """Factor of the posterior's radii of noisy frames of an object that was not calibrated, by training views of 17 objects
 without calibrations (docs/experiments/085.md); those of clean frames are right as they are."""
-
-LEAST_RADIUS = 0.1
-"""Radius in scene units that every position has in addition under a calibration, which whole views have made: the paper
-camera's noise."""
 
 _FREEDOM = np.linspace(1.0, 3.0, 201)
 _QUANTILE = chi2.ppf(LEVEL, _FREEDOM)
 """Quantile of chi square by its degrees of freedom, between which it is nearly straight."""
 
 
-def radius95(covariance: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, " n"]:
+def radius95(covariance: Float[np.ndarray, "n 3 3"]) -> Values:
     """Return the radius of the ball around the mean that holds a Gaussian point with probability 0.95.
 
     By a chi square of the same mean and variance as the squared distance (Satterthwaite, Biometrics Bulletin 1946):
@@ -78,9 +77,9 @@ class RadiusParts:
         reach: distance of the farthest of the other states, around which a place is as unsure as around this one.
     """
 
-    gaussian: Float[np.ndarray, " n"]
-    open: Float[np.ndarray, " n"]
-    reach: Float[np.ndarray, " n"]
+    gaussian: Values
+    open: Values
+    reach: Values
 
     @classmethod
     def of(
@@ -95,9 +94,9 @@ class RadiusParts:
         gaussian[:, range(3), range(3)] += residue**2 / 3
         return cls(radius95(gaussian), radius95(far), np.linalg.norm(ways, axis=1).max(axis=1, initial=0.0))
 
-    def radii(self, scale: float = 1.0, extra_radius: float = 0.0) -> Float[np.ndarray, " n"]:
-        """Radii with a scale of the Gaussian, and a radius that all points have in addition; in the parts' unit."""
-        result: np.ndarray = self.reach + np.sqrt((scale * self.gaussian) ** 2 + self.open**2 + extra_radius**2)
+    def radii(self, scale: float = 1.0) -> Values:
+        """Radii with a scale of the Gaussian, in the parts' unit."""
+        result: np.ndarray = self.reach + np.hypot(scale * self.gaussian, self.open)
         return result
 
 
@@ -163,7 +162,7 @@ class Posterior:
         """Motion of each material point with each of p independent standard normal numbers, in the object's axes."""
         return self._motion(slice(None))
 
-    def _motion(self, rows: slice | Int[np.ndarray, " n"]) -> Float32[np.ndarray, "n 3 p"]:
+    def _motion(self, rows: slice | Indices) -> Float32[np.ndarray, "n 3 p"]:
         pose, state = self._local
         moved = rigid_motion(self._arm[rows]).reshape(-1, POSE) @ pose
         if len(state):
@@ -178,7 +177,7 @@ class Posterior:
             )
             return RadiusParts.of(motion, open_motion, ways, self.residue)
 
-    def radii_of(self, rows: Int[np.ndarray, " n"]) -> RadiusParts:
+    def radii_of(self, rows: Indices) -> RadiusParts:
         """Radii of 95 % of some material points alone, which cost as little as they are few."""
         with limit_blas_threads():
             return RadiusParts.of(self._motion(rows), self.open[rows], self.ways[rows], self.residue)
@@ -363,11 +362,11 @@ class Explanation:
             tolerance.
     """
 
-    place: Float[np.ndarray, "3"]
+    place: Vector
     shares: dict[Evidence, float]
-    points: Float[np.ndarray, "n 3"]
-    weights: Float[np.ndarray, " n"]
-    influence: Float[np.ndarray, "n 3"]
+    points: Points
+    weights: Values
+    influence: Points
     unexplained: Float[np.ndarray, "k 3"]
 
     def __repr__(self) -> str:
@@ -392,11 +391,25 @@ class SegmentUncertainty:
         name: of the segment.
         centroid_radius95: radius around its centroid within which the true one lies with probability 0.95, input unit.
         volume95: least and greatest volume that its own is with that probability, input unit cubed.
+        expected_iou: intersection over union of its volume with the true one, as it may be expected.
     """
 
     name: str
     centroid_radius95: float
     volume95: tuple[float, float]
+    expected_iou: float
+
+
+def expected_iou(swept: Float[np.ndarray, "s 2 a"]) -> float:
+    """Mean of the intersections over unions that volumes have with true ones, by what is between both.
+
+    Half of that is a volume's alone, half the true one's alone, in the mean over what is as likely inside as outside.
+
+    Args:
+        swept: of s segments, and a states that are alike, as ``Uncertainty.swept``.
+    """
+    volume, between = swept.sum(axis=0)
+    return float(((volume - between / 2) / (volume + between / 2)).mean())
 
 
 @dataclass(frozen=True, eq=False)
@@ -412,13 +425,11 @@ class Uncertainty:
         model: statistical model of the object.
         scale: factor by which views of training seeds showed the posterior's radii to be too small, in frames like
             this; None where that was not measured.
-        extra_radius: radius added in quadrature at every position, ``LEAST_RADIUS`` under a calibration; scene units.
     """
 
     optimum: Optimum
     model: StatisticalModel
     scale: float | None = None
-    extra_radius: float = 0.0
 
     @property
     def calibrated(self) -> bool:
@@ -435,8 +446,8 @@ class Uncertainty:
         """Factor of the posterior's radii."""
         return self.scale or (UNCALIBRATED if self.optimum.frame.shares_noise else 1.0)
 
-    def _of(self, parts: RadiusParts) -> Float[np.ndarray, " n"]:
-        return self.optimum.unit * parts.radii(self.factor, self.extra_radius)
+    def _of(self, parts: RadiusParts) -> Values:
+        return self.optimum.unit * parts.radii(self.factor)
 
     @cached_property
     def parts(self) -> RadiusParts:
@@ -465,7 +476,7 @@ class Uncertainty:
         counts = self.model.vertex_counts
         return Radii(material, self.model.labels, self.material, counts, self.calibrated)
 
-    def of_rest(self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def of_rest(self, points: Points, labels: UInt8[np.ndarray, " n"]) -> Values:
         """``radius95`` of the positions to which points at rest, of the segments ``labels``, are registered."""
         result = np.empty(len(points))
         for first in range(0, len(points), AT_ONCE):
@@ -488,16 +499,41 @@ class Uncertainty:
         return mesh.owned_volumes, motion, RadiusParts.of(motion[:, 1:], open_motion, ways)
 
     @cached_property
+    def swept(self) -> Float[np.ndarray, "s 2 a"]:
+        """Volume in each segment's surface, and that which is expected between it and the true one; scene units.
+
+        First by the Gaussian alone, then as if each of the other states that explain the frame alike were its mean.
+        Turns of a segment onto itself (``Posterior.open``) leave its surface where it is.
+        """
+        posterior = self.posterior
+        mesh = self.model.mesh(posterior.material)
+        # a vertex's area, outwards, is the derivative of the volume
+        area = np.concatenate([moment_gradients(segment, np.zeros(3))[0] for segment in mesh.segments])
+        moved = np.einsum("vip,vi->vp", posterior.motion[: len(area)], area @ posterior.posed.rotation)
+        variance = (moved**2).sum(axis=1) + posterior.residue**2 / 3 * (area**2).sum(axis=1)
+        ways = np.abs(np.einsum("vio,vi->vo", posterior.ways[: len(area)], area))
+        between = MEAN_ABSOLUTE * np.sqrt(variance)[:, None] + np.pad(ways, ((0, 0), (1, 0)))
+        each = np.add.reduceat(between, np.cumsum([0, *self.model.vertex_counts[:-1]]))
+        volumes = np.array([segment.volume for segment in mesh.segments])[:, None]
+        return np.stack([np.broadcast_to(volumes, each.shape), np.minimum(each, 2 * volumes)], axis=1)
+
+    @cached_property
     def segments(self) -> tuple[SegmentUncertainty, ...]:
         """Each segment's, of the volume that belongs to it, without that of segments nested in it."""
         unit = self.optimum.unit
         result = list[SegmentUncertainty]()
         volumes, motion, parts = self._owned
-        for name, volume, moved, radius in zip(self.model.rest.names, volumes, motion, self._of(parts), strict=True):
+        each = zip(self.model.rest.names, volumes, motion, self._of(parts), self.swept, strict=True)
+        for name, volume, moved, radius, swept in each:
             off = WITHIN * self.factor * float(np.linalg.norm(moved[0]))
             between = (max(float(volume) - off, 0.0) * unit**3, (float(volume) + off) * unit**3)
-            result.append(SegmentUncertainty(name, float(radius), between))
+            result.append(SegmentUncertainty(name, float(radius), between, expected_iou(swept[None])))
         return tuple(result)
+
+    @property
+    def expected_iou(self) -> float:
+        """Intersection over union of all segments' volume with the true one, as it may be expected."""
+        return expected_iou(self.swept)
 
     @cached_property
     def _whitened(
@@ -520,7 +556,7 @@ class Uncertainty:
 
     def explain(
         self,
-        place: Float[np.ndarray, "3"],
+        place: Vector,
         motion: Float[np.ndarray, "3 p"],
         T_registration_fit: Float[np.ndarray, "4 4"],
     ) -> Explanation:
@@ -554,7 +590,7 @@ class Uncertainty:
         """Motion of a point of the rest model, which moves along with the segment ``label``."""
         return self.posterior.motion_at(self.model.weights(point, label))[0]
 
-    def summary(self, radii: Float[np.ndarray, " n"] | None = None) -> dict[str, float | bool]:
+    def summary(self, radii: Values | None = None) -> dict[str, float | bool]:
         """Median and greatest ``radius95`` of the vertices, or of the given radii, and whether they are calibrated."""
         radii = np.concatenate(self.vertices) if radii is None else radii
         return {"median": float(np.median(radii)), "max": float(radii.max()), "calibrated": self.calibrated}

@@ -392,13 +392,13 @@ def owned_gradients(mesh: SegmentedMesh) -> Float[ndarray, "s 4 v 3"]:
         inner = [each for each in within if not any((each, other) in mesh.nesting for other in within)]
         for index, sign in ((owner, 1.0), *((each, -1.0) for each in inner)):
             rows = slice(ends[index], ends[index + 1])
-            result[owner, :, rows] = sign * _gradients(mesh.segments[index], center)
+            result[owner, :, rows] = sign * moment_gradients(mesh.segments[index], center)
         # about the centroid the first moment is zero, so that the volume's change does not move it
         result[owner, 1:] /= volumes[owner]
     return result
 
 
-def _gradients(segment: Segment, origin: Vector) -> Float[ndarray, "4 v 3"]:
+def moment_gradients(segment: Segment, origin: Vector) -> Float[ndarray, "4 v 3"]:
     """Derivatives of a mesh's volume, and of its first moment about an origin, by its vertices."""
     corners = segment.vertices[segment.faces] - origin
     area = np.cross(corners[:, [1, 2, 0]], corners[:, [2, 0, 1]]) / 6.0  # of the volume, by each corner

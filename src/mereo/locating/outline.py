@@ -10,10 +10,9 @@ jump in depth; and no pixel has seen past it.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
 from scipy import ndimage
 
-from mereo.geometry.camera import DepthImage
+from mereo.geometry.camera import DepthImage, PixelMask, PixelValues
 from mereo.geometry.surface_patches import noise_of_differences, second_differences
 from mereo.locating.regions import off_planes, steepest
 
@@ -47,10 +46,10 @@ class Jumps(NamedTuple):
     """
 
     image: DepthImage
-    step: Float[np.ndarray, "h w"]
-    nearer: Bool[np.ndarray, "h w"]
-    known: Bool[np.ndarray, "h w"]
-    creased: Bool[np.ndarray, "h w"]
+    step: PixelValues
+    nearer: PixelMask
+    known: PixelMask
+    creased: PixelMask
 
     @classmethod
     def of(cls, image: DepthImage, length: float) -> "Jumps":
@@ -74,9 +73,7 @@ class Jumps(NamedTuple):
         return cls(image, step, nearer, known, creased & planes)
 
 
-def _along_rows(
-    depth: Float[np.ndarray, "h w"], step: Float[np.ndarray, "h w"]
-) -> tuple[Bool[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
+def _along_rows(depth: PixelValues, step: PixelValues) -> tuple[PixelMask, PixelMask]:
     """``Jumps.nearer`` and ``Jumps.known`` by the rows alone."""
     width = depth.shape[1]
     measured = np.flatnonzero(depth)
@@ -120,7 +117,7 @@ class Outline(NamedTuple):
         return float(edge + PAST * np.sqrt(self.past) / independent + seen)
 
 
-def compare_outline(jumps: Jumps, depth: Float[np.ndarray, "h w"]) -> Outline:
+def compare_outline(jumps: Jumps, depth: PixelValues) -> Outline:
     """Compare the rendered ``depth`` of a posed object, 0 where it is not, with an image's."""
     measured, (height, width) = jumps.image.depth, depth.shape
     shown = depth > 0

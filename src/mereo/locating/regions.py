@@ -4,12 +4,12 @@ DepthImage, length of the object -thinned-> DepthImage -regions-> masks, the lik
 """
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from scipy import ndimage
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mereo.geometry.camera import Camera, DepthImage
+from mereo.geometry.camera import Camera, DepthImage, PixelMask
 from mereo.geometry.conventions import MIN_POINTS
 from mereo.geometry.downsampling import STEEPEST
 from mereo.reconstruction.isolation import largest_plane
@@ -57,7 +57,7 @@ def steepest(image: DepthImage) -> float:
     return STEEPEST / image.camera.focal_px
 
 
-def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
+def off_planes(image: DepthImage, length: float) -> PixelMask:
     """Pixels that are measured, and of no connected part of a plane that is longer than an object of this ``length``.
 
     So a face of the object stays, and so does what the plane of a table cuts elsewhere.
@@ -83,7 +83,7 @@ def off_planes(image: DepthImage, length: float) -> Bool[np.ndarray, "h w"]:
     return off
 
 
-def parted(pixels: Bool[np.ndarray, "h w"], label: Int[np.ndarray, "h w"]) -> list[Bool[np.ndarray, "h w"]]:
+def parted(pixels: PixelMask, label: Int[np.ndarray, "h w"]) -> list[PixelMask]:
     """Parts of some pixels by their numbers, but for those that are too small for a fit."""
     return [pixels & (label == number) for number in np.flatnonzero(np.bincount(label[pixels]) >= MIN_POINTS)]
 
@@ -104,14 +104,14 @@ def connected_pixels(depth: Float[np.ndarray, "h w"], step: float) -> Int[np.nda
     return np.asarray(connected_components(edges, directed=False)[1].reshape(depth.shape))
 
 
-def regions(image: DepthImage, length: float, area: float) -> list[Bool[np.ndarray, "h w"]]:
+def regions(image: DepthImage, length: float, area: float) -> list[PixelMask]:
     """Connected surfaces of an image that may be an object of this ``length``, the nearest in ``area`` first.
 
     ``length`` is in the image's unit, and ``area``, which a whole object covers, in its square.
     """
     points = image.camera.directions() * image.depth[..., None]
     pixel = image.depth**2 / (image.camera.focal_x_px * image.camera.focal_y_px)
-    masks = list[Bool[np.ndarray, "h w"]]()
+    masks = list[PixelMask]()
     parts = [(off_planes(image, length), np.inf)]
     for gap in GAPS:
         wholes = parts

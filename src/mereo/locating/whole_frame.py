@@ -10,7 +10,6 @@ from itertools import islice
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 from scipy.spatial import ConvexHull, cKDTree
 
 from mereo.fitting.modes import bend_by_few, fit_from_far
@@ -28,7 +27,7 @@ from mereo.fitting.registration.answer_frame import (
 from mereo.fitting.registration.recognition import FIT, REFUSED, Signs, known_by
 from mereo.fitting.registration.register import Registrar
 from mereo.fitting.search import ROUNDS, SearchRound, screen_poses
-from mereo.geometry.camera import DepthImage
+from mereo.geometry.camera import DepthImage, PixelMask
 from mereo.geometry.conventions import MIN_POINTS, NoFit
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.io.bounds import Cells, Instances, check_value
@@ -74,7 +73,7 @@ distance from its surface up to which those of its region are."""
 
 def part_of(
     seen: Observation,
-    mask: Bool[np.ndarray, "h w"],
+    mask: PixelMask,
     name: str = "whole frame",
     detail: str = "where the object is likeliest",
 ) -> Observation:
@@ -86,7 +85,7 @@ def part_of(
     return replace(seen, cloud=seen.frame.cloud.rows(keep), selection=selection, steps=steps)
 
 
-def pixels_near(image: DepthImage, mesh: SegmentedMesh, reach: float) -> Bool[np.ndarray, "h w"]:
+def pixels_near(image: DepthImage, mesh: SegmentedMesh, reach: float) -> PixelMask:
     """Pixels that see what lies as far away as a mesh does there, up to a ``reach`` in the image's unit."""
     depth = render_depth(mesh, image.camera).depth
     return image.valid & (depth > 0) & (np.abs(image.depth - depth) < reach)
@@ -103,7 +102,7 @@ class Place:
         outline: of that state.
     """
 
-    mask: Bool[np.ndarray, "h w"]
+    mask: PixelMask
     states: tuple[Posed, ...]
     mesh: SegmentedMesh
     outline: Outline
@@ -152,18 +151,18 @@ class WholeFrame:
         """``NEAR`` in the image's unit."""
         return NEAR * self.registrar.model.half * self.unit
 
-    def is_at_point(self, pixels: Bool[np.ndarray, "h w"]) -> bool:
+    def is_at_point(self, pixels: PixelMask) -> bool:
         """Whether some pixels of the thinned image are at the frame's point; any are where it has none."""
         column, row = self.seen.point or (0, 0)
         rows, columns = np.nonzero(pixels)
         distance = np.hypot(columns - column // self.every, rows - row // self.every)
         return self.seen.point is None or bool(distance.min(initial=np.inf) <= HOLE_PX)
 
-    def explained(self, mesh: SegmentedMesh) -> Bool[np.ndarray, "h w"]:
+    def explained(self, mesh: SegmentedMesh) -> PixelMask:
         """Pixels of the thinned image that see what lies as far away as a mesh does there."""
         return pixels_near(self.jumps.image, mesh, self.reach)
 
-    def is_among(self, taken: Bool[np.ndarray, "h w"], mesh: SegmentedMesh) -> bool:
+    def is_among(self, taken: PixelMask, mesh: SegmentedMesh) -> bool:
         """Whether most of the pixels that a mesh explains are taken."""
         return bool(taken.any()) and 2 * int((each := taken[self.explained(mesh)]).sum()) > len(each)
 
@@ -174,7 +173,7 @@ class WholeFrame:
         registrar = self.registrar
         return Problem(registrar.states, cloud.evidence(self.unit), cloud.scale_std, registrar.config)
 
-    def place(self, mask: Bool[np.ndarray, "h w"], states: Sequence[Posed]) -> Place:
+    def place(self, mask: PixelMask, states: Sequence[Posed]) -> Place:
         """Place of some states."""
         model, (posed, *_) = self.registrar.states, states
         mesh = model.mesh(self.unit * posed.place(model.material(posed.z)))
@@ -184,7 +183,7 @@ class WholeFrame:
         """What the thinned image says of a mesh's outline."""
         return compare_outline(self.jumps, render_depth(mesh, self.jumps.image.camera).depth)
 
-    def look(self, mask: Bool[np.ndarray, "h w"]) -> Place:
+    def look(self, mask: PixelMask) -> Place:
         """Place of a region, with some states that are quickly fitted to it."""
         problem = self.problem(part_of(self.thin, mask))
         states = bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted)

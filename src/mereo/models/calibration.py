@@ -79,17 +79,14 @@ class Calibration(BaseModel, frozen=True):
     ece: tuple[Share, Share] | None = None
 
     def radii(self, *, draws: bool, noisy: bool) -> RadiusFactors:
-        """What makes the radii of a fit of draws, or of the modes, to a frame.
+        """What makes the radii of a fit of draws, or of the modes, to a frame; none makes them shorter.
 
-        A clean frame's fit may be surer than its fixed weights say. A noisy one's weights follow the noise, so that no
-        scale makes radii shorter.
+        A calibration has seen whole objects alone, whose fits may be surer than the fixed weights of a clean frame say.
         """
         scale, misfit = self.radius_scale, self.usual_misfit
         if draws:
             scale, misfit = self.draws_radius_scale, self.draws_usual_misfit
-        if noisy:
-            return RadiusFactors(None if scale is None else max(scale, 1.0))
-        return RadiusFactors(scale, misfit)
+        return RadiusFactors(scale and max(scale, 1.0), None if noisy else misfit)
 
     @property
     def scaling(self) -> Scaling:

@@ -17,13 +17,13 @@ from jaxtyping import Float
 from numpy import ndarray
 from numpy.linalg import inv, norm
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.special import chdtri, ndtr
+from scipy.special import ndtr
 
 from mereo.deformation.samplers import RandomMotion
 from mereo.fitting.problem.gauss_newton import rigid_motion
 from mereo.fitting.registration.answer import Answer
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.uncertainty import LEVEL, WITHIN
+from mereo.fitting.uncertainty import WITHIN
 from mereo.geometry.brief import as_exact_as
 from mereo.geometry.conventions import Range
 from mereo.geometry.transforms import Indices, NamedPoses, fit_rigid, transform_points
@@ -190,12 +190,10 @@ def pose_covariance(registration: Registration) -> Float[ndarray, "6 6"] | None:
     lever = target.mean(axis=0) - placed[:3, 3]
     shift = np.eye(3)[:, None] / len(arm) - np.cross(turn, lever, axisa=0, axisc=0)
     moves = _moves(registration, np.concatenate([turn, shift]))
-    sure = registration.uncertainty
-    if moves is None or sure is None:
+    if moves is None:
         return None
     factor = np.hstack(moves)
-    covariance = factor @ factor.T
-    covariance[range(3, 6), range(3, 6)] += (sure.optimum.unit * sure.extra_radius) ** 2 / chdtri(3, 1 - LEVEL)
+    covariance: Float[np.ndarray, "6 6"] = factor @ factor.T
     return covariance
 
 

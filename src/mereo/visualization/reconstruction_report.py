@@ -365,7 +365,7 @@ def _facts(summary: Facts, unit: Unit, verdict: Trust) -> list[str]:
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
     if isinstance(radius95, Mapping):
-        facts.append(radius_words(radius95, unit))
+        facts += [radius_words(radius95, unit), iou_words(_block(summary, "registration")["expected_iou"])]
     if spacing is not None:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
     if summary.get("device"):
@@ -378,6 +378,11 @@ def radius_words(radius95: Facts, unit: Unit) -> str:
     middle, most = (f"{rounded(radius95[key] * unit.length_factor)} {unit.length_name}" for key in ("median", "max"))
     level = describe_level(bool(radius95.get("calibrated")))
     return f"its points are within {middle} of their true places in the median, {most} where it is least sure ({level})"
+
+
+def iou_words(expected_iou: float) -> str:
+    """How much of a registered model's volume is expected to be right, in words."""
+    return f"its intersection over union with the true object is expected to be {expected_iou:.2f}"
 
 
 def _answer(registration: Facts, verdict: Trust) -> str:

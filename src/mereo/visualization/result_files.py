@@ -77,7 +77,7 @@ def summary_of(
     if fit is not None and sure is not None:
         radii["radius95"] = {**sure.summary(), "unit_m": frame.unit_m}
         for row, segment in zip(segments, sure.segments, strict=True):
-            row |= {"centroid_radius95": segment.centroid_radius95, "volume95": segment.volume95}
+            row |= asdict(segment)
         radii["pose_covariance"] = pose_covariance(fit)
     joints = {name: joint.facts() for name, joint in measure_joints(answer).items()}
     return {

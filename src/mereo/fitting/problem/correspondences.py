@@ -16,7 +16,7 @@ from mereo.deformation.moving_least_squares import PointWeights, spread
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, geman_mcclure, in_space
 from mereo.fitting.problem.problem import Problem
 from mereo.fitting.problem.residuals import ROBUST, PlacesTerm, Prior
-from mereo.geometry.transforms import robust_rigid
+from mereo.geometry.transforms import Points, robust_rigid
 from mereo.models.trained import EncodedCloud, Trained
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -44,8 +44,8 @@ class Correspondences:
         confidence: probability of that segment, for observed points among the segments alone.
     """
 
-    points: Float[np.ndarray, "n 3"]
-    rest: Float[np.ndarray, "n 3"]
+    points: Points
+    rest: Points
     labels: UInt8[np.ndarray, " n"]
     confidence: Float[np.ndarray, " n"]
 

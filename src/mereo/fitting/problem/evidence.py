@@ -23,7 +23,7 @@ from mereo.deformation.moving_least_squares import spread
 from mereo.geometry.camera import NOT_KNOWN, SharedNoise, SightKind, SightLines
 from mereo.geometry.downsampling import means_along_sight, thin_to_grid
 from mereo.geometry.surface_patches import roughness
-from mereo.geometry.transforms import rotation_along, unit_rows
+from mereo.geometry.transforms import Points, Values, rotation_along, unit_rows
 
 MOST_POINTS = 6000
 """Denser clouds are averaged to so many points, which have less noise."""
@@ -158,13 +158,13 @@ class SharedErrors:
         amplitudes: of each wave along each axis, N(0, 1) before the frame was seen.
     """
 
-    measured: Float[np.ndarray, "n 3"]
+    measured: Points
     axes: Float32[np.ndarray, "n 3 3"]
     waves: Float32[np.ndarray, "n w"]
     amplitudes: Float[np.ndarray, "a"]
 
     @classmethod
-    def none(cls, points: Float[np.ndarray, "n 3"]) -> "SharedErrors":
+    def none(cls, points: Points) -> "SharedErrors":
         """Nothing, of points of which nothing is known."""
         axes = np.zeros((len(points), 3, 3), dtype=np.float32)
         return cls(points, axes, np.zeros((len(points), 0), dtype=np.float32), np.zeros(0))
@@ -180,7 +180,7 @@ class SharedErrors:
         along = self.waves @ self.amplitudes.reshape(3, -1).T.astype(np.float32)
         return np.einsum("na,nai->ni", along, self.axes)
 
-    def along(self, normals: Float[np.ndarray, "n 3"]) -> Float32[np.ndarray, "n a"]:
+    def along(self, normals: Points) -> Float32[np.ndarray, "n a"]:
         """How much each point is off along a normal where an amplitude is 1."""
         across = np.einsum("nai,ni->na", self.axes, normals.astype(np.float32))
         return (across[:, :, None] * self.waves[:, None]).reshape(len(normals), -1)
@@ -203,7 +203,7 @@ class ObservedPoints(ABC):
         around: indices of each point's neighbours, up to 8.
     """
 
-    points: Float[np.ndarray, "n 3"]
+    points: Points
     chosen: Int[np.ndarray, " p"]
     around: Int[np.ndarray, "n k"]
 
@@ -237,7 +237,7 @@ class ObservedPoints(ABC):
         x, y, height = (centered @ np.linalg.svd(centered, full_matrices=False)[2].T).T
         terms = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
 
-        def away(patch: Float[np.ndarray, "6"]) -> Float[np.ndarray, " n"]:
+        def away(patch: Float[np.ndarray, "6"]) -> Values:
             slope = np.hypot(patch[1] + 2 * patch[3] * x + patch[4] * y, patch[2] + patch[4] * x + 2 * patch[5] * y)
             distance: np.ndarray = (height - terms @ patch) / np.hypot(1.0, slope)
             return distance
@@ -300,16 +300,14 @@ class ObservedPoints(ABC):
         return rows[order[:, 0]]
 
 
-def plane_normals(points: Float[np.ndarray, "n 3"], places: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
+def plane_normals(points: Points, places: Float[np.ndarray, "p 3"]) -> Float[np.ndarray, "p 3"]:
     """Unit normals, of either sign, of the planes through the points around each place."""
     near = cKDTree(points).query(places, k=min(NORMAL_POINTS, len(points)))[1]
     patches = points[near] - points[near].mean(axis=1, keepdims=True)
     return np.linalg.eigh(np.einsum("pki,pkj->pij", patches, patches))[1][:, :, 0]
 
 
-def lines_along(
-    points: Float[np.ndarray, "n 3"], unknown: Float[np.ndarray, "u 3"], pitch: float | None = None
-) -> dict[str, Any]:
+def lines_along(points: Points, unknown: Float[np.ndarray, "u 3"], pitch: float | None = None) -> dict[str, Any]:
     """What ``Evidence`` says of the lines of sight to points, and along ``unknown`` ones, of which nothing is known."""
     ranges = np.linalg.norm(points, axis=1)
     sight = cKDTree(unit_rows(points))
@@ -342,7 +340,7 @@ class Evidence(ObservedPoints):
     """
 
     sight: cKDTree
-    ranges: Float[np.ndarray, " n"]
+    ranges: Values
     front: Float[np.ndarray, " s"]
     pitch: float
     past: PastLines | None = None
@@ -353,11 +351,11 @@ class Evidence(ObservedPoints):
     @classmethod
     def of(
         cls,
-        points: Float[np.ndarray, "n 3"],
+        points: Points,
         outliers: Float[np.ndarray, "d 3"] | None = None,
         observed_samples: int = OBSERVED_SAMPLES,
         lines: SightLines = UNDECIDED,
-        normals: Float[np.ndarray, "n 3"] | None = None,
+        normals: Points | None = None,
         most: int = MOST_POINTS,
     ) -> "Evidence":
         """Prepare a cloud, with so many ``observed_samples`` at most; its lines of sight start at the origin.
@@ -513,9 +511,7 @@ class Evidence(ObservedPoints):
         is_unseen = is_open & (near < len(self.points)) & (angle > UNSEEN_PITCHES * self.pitch)
         return float(shown[is_unseen].sum() / max(shown.sum(), np.finfo(float).tiny))
 
-    def violations(
-        self, vertices: Float[np.ndarray, "n 3"], slack: float
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    def violations(self, vertices: Points, slack: float) -> tuple[Points, Values]:
         """Unit direction in which each vertex must move to be allowed, and how far; 0 where it is allowed.
 
         ``slack`` is how far in front of observed points a vertex may be.
@@ -542,9 +538,7 @@ class Evidence(ObservedPoints):
             amount[rows[distance[rows] > self._free(toward[rows], nearest) - slack]] = 0.0
         return direction, amount
 
-    def along(
-        self, toward: Float[np.ndarray, "n 3"]
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    def along(self, toward: Points) -> tuple[Points, Values, Values]:
         """Look up lines of sight, as ``violations`` takes them.
 
         Returns the unit vector of the nearest one that met the object or of which nothing is known, the distance before
@@ -555,7 +549,7 @@ class Evidence(ObservedPoints):
         free = np.where(angle > SILHOUETTE_PITCHES * self.pitch, self._free(toward, nearest), -1.0)
         return self.sight.data[near], self.front[near], free
 
-    def _free(self, toward: Float[np.ndarray, "n 3"], unknown: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    def _free(self, toward: Points, unknown: Values) -> Values:
         """Distance up to which lines of sight around the object are free: infinite where nothing ends them.
 
         ``unknown`` is the angle to the nearest line of sight on which nothing is known, infinite where one that met the
@@ -579,18 +573,18 @@ class SurfaceEvidence(ObservedPoints):
         other_lines: kind of all lines of sight.
     """
 
-    normals: Float[np.ndarray, "n 3"]
+    normals: Points
     lift: Callable[[np.ndarray], np.ndarray]
     other_lines: SightKind = "none"
 
     @classmethod
     def of(
         cls,
-        points: Float[np.ndarray, "n 3"],
+        points: Points,
         outliers: Float[np.ndarray, "d 3"] | None = None,
         observed_samples: int = OBSERVED_SAMPLES,
         lines: SightLines = UNDECIDED,
-        normals: Float[np.ndarray, "n 3"] | None = None,
+        normals: Points | None = None,
         most: int = MOST_POINTS,
     ) -> "SurfaceEvidence":
         """Prepare a surface, of which some ``most`` points are kept; ``outliers`` and ``lines`` say nothing of it.
@@ -650,9 +644,7 @@ class SurfaceEvidence(ObservedPoints):
         """Nothing that a camera should have seen."""
         return 0.0
 
-    def violations(
-        self, vertices: Float[np.ndarray, "n 3"], slack: float
-    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    def violations(self, vertices: Points, slack: float) -> tuple[Points, Values]:
         """Nothing is ruled out."""
         return np.zeros_like(vertices), np.zeros(len(vertices))
 

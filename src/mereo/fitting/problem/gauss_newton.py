@@ -15,6 +15,8 @@ from jaxtyping import Float
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
+from mereo.geometry.transforms import Points
+
 POSE = 7
 """Parameters before the coefficients."""
 
@@ -35,7 +37,7 @@ class Posed:
     z: Float[np.ndarray, " k"]
     log_scale: float = 0.0
 
-    def place(self, unposed: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    def place(self, unposed: Points) -> Points:
         """Points of the model's frame in the camera frame."""
         return np.exp(self.log_scale) * (unposed @ self.rotation.T) + self.translation
 
@@ -134,9 +136,9 @@ def amplitudes(
 
 def along(
     posed: Posed,
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     modes: Float[np.ndarray, "n 3 k"],
-    direction: Float[np.ndarray, "n 3"],
+    direction: Points,
 ) -> Float[np.ndarray, "n p"]:
     """Derivatives of ``direction . y`` at posed points with their modes."""
     arm = points - posed.translation
@@ -149,9 +151,7 @@ def along(
     return result
 
 
-def in_space(
-    posed: Posed, points: Float[np.ndarray, "n 3"], modes: Float[np.ndarray, "n 3 k"]
-) -> Float[np.ndarray, "m p"]:
+def in_space(posed: Posed, points: Points, modes: Float[np.ndarray, "n 3 k"]) -> Float[np.ndarray, "m p"]:
     """Derivatives of y at posed points, three rows for each point: x, y, z."""
     result = np.empty((len(points), 3, POSE + modes.shape[2]), dtype=modes.dtype)
     result[:, :, :POSE] = rigid_motion((points - posed.translation).astype(modes.dtype))
@@ -159,7 +159,7 @@ def in_space(
     return result.reshape(3 * len(points), -1)
 
 
-def rigid_motion(arm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
+def rigid_motion(arm: Points) -> Float[np.ndarray, "n 3 7"]:
     """Derivatives of points by a turn, a shift and the scale, from their positions relative to the pose's centre."""
     rigid = np.zeros((len(arm), 3, POSE), dtype=arm.dtype)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
@@ -169,7 +169,7 @@ def rigid_motion(arm: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 7"]:
     return rigid
 
 
-def cross(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+def cross(a: Points, b: Points) -> Points:
     """Cross products; numpy's own spends more time on the axes than on the numbers."""
     result = np.empty_like(a)
     for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):

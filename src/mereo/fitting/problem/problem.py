@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 from scipy.optimize import isotonic_regression
-from scipy.stats import norm
+from scipy.stats import median_abs_deviation, norm
 
 from mereo.fitting.config import FitConfig
 from mereo.fitting.problem.evidence import (
@@ -40,6 +40,7 @@ from mereo.fitting.problem.residuals import (
     robust_square,
     silhouette_losses,
 )
+from mereo.geometry.transforms import Values
 from mereo.scenes.statistical_model import SILHOUETTE_VERTICES, StatisticalModel
 
 COARSE = 3
@@ -254,7 +255,7 @@ class Problem:
         """The same, without lines of sight."""
         return surface.compared(self.evidence.observed_samples, None, self.alike)
 
-    def offsets(self, surface: Surface, far: float | None = None) -> Float[np.ndarray, " n"]:
+    def offsets(self, surface: Surface, far: float | None = None) -> Values:
         """``Surface.offsets`` of all observed points."""
         return surface.offsets(self.evidence.points, far, self.evidence.all_alike(self.normal_length))
 
@@ -392,9 +393,6 @@ class Problem:
 # fitted model takes these away. What it leaves over is noise where every pixel differs; where neighbours share it, or
 # it is more than the calmest part of the cloud has, the model is wrong.
 
-TO_STD = 1.4826
-"""Standard deviation of normal numbers over the median of their absolute values."""
-
 CLEAN = 0.15
 """Noise, in scene units, up to which the constants are as they are; more is a camera's. Clean frames have 0.05 to 0.1,
 and a clean frame's fit that is not quite right leaves less over, too."""
@@ -422,7 +420,7 @@ ACCEPTED = 0.85
 was believed less than .88; wrong ones of thin objects .76 to .81 (docs/experiments/085.md)."""
 
 
-def shared_variance(offset: Float[np.ndarray, " n"], observed: ObservedPoints, freedom: int) -> float:
+def shared_variance(offset: Values, observed: ObservedPoints, freedom: int) -> float:
     """Variance of a point, were all independent, that leaves a fit as unsure as what it leaves over.
 
     Differences between neighbouring patches of the picture, from single points to halves of the cloud, all have the
@@ -444,30 +442,29 @@ def shared_variance(offset: Float[np.ndarray, " n"], observed: ObservedPoints, f
     return float(left * whole / rising[0])
 
 
-def unshared(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"]) -> Float[np.ndarray, " n"]:
+def unshared(offset: Values, around: Int[np.ndarray, "n k"]) -> Values:
     """What each point's offset does not share with those around it, as large as its noise alone would be."""
     # the median of k neighbours is itself off by pi / 2k of their variance
     return (offset - np.median(offset[around], axis=1)) / np.sqrt(1.0 + np.pi / (2 * around.shape[1]))
 
 
-def noise_of(offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"] | None = None) -> float:
+def noise_of(offset: Values, around: Int[np.ndarray, "n k"] | None = None) -> float:
     """Standard deviation of offsets, robust: of all that a fit leaves over, or of what neighbours do not share.
 
     Args:
         offset: signed distance of each observed point from a fitted surface.
         around: indices of each point's neighbours.
     """
-    return TO_STD * float(np.median(np.abs(offset if around is None else unshared(offset, around))))
+    left = offset if around is None else unshared(offset, around)
+    return float(median_abs_deviation(left, center=lambda _, axis: 0.0, scale="normal"))
 
 
-def is_normal(offset: Float[np.ndarray, " n"]) -> bool:
+def is_normal(offset: Values) -> bool:
     """Whether offsets are spread as normal numbers are; those of a wrong fit are small in most places, or large."""
     return float(np.quantile(np.abs(offset), 0.95)) <= NORMAL * float(np.median(np.abs(offset)))
 
 
-def shared(
-    offset: Float[np.ndarray, " n"], around: Int[np.ndarray, "n k"], sigma: float, expected: float = 0.0
-) -> float:
+def shared(offset: Values, around: Int[np.ndarray, "n k"], sigma: float, expected: float = 0.0) -> float:
     """Misfit of a cloud, in misfits of noise: what points do not share with those around them, and what is expected."""
     noise = robust_square(np.hypot(unshared(offset, around), expected), sigma).mean()
     return float(robust_square(offset, sigma).mean() / max(noise, 1e-12))

@@ -19,7 +19,7 @@ from mereo.fitting.problem.evidence import Directions, Evidence, Observed, Share
 from mereo.fitting.problem.gauss_newton import POSE, NormalEquations, Posed, Rows, along, cross, geman_mcclure
 from mereo.geometry.mesh import barycentric
 from mereo.geometry.solids import cast_rays, search_tree
-from mereo.geometry.transforms import unit_rows
+from mereo.geometry.transforms import Points, Values, unit_rows
 from mereo.scenes.mechanism import Mechanism, moved_by, placed
 from mereo.scenes.statistical_model import StatisticalModel
 
@@ -283,9 +283,9 @@ class PlacesTerm:
         confidence: of each, as a weight.
     """
 
-    target: Float[np.ndarray, "n 3"]
+    target: Points
     weights: PointWeights
-    confidence: Float[np.ndarray, " n"]
+    confidence: Values
 
     def energy(self, material: Float[np.ndarray, "m 3"], sigma: float) -> float:
         """Mean robust squared distance from where a state's material points have them, in squared sigmas."""
@@ -323,7 +323,7 @@ def cloud_rows(
 def add_silhouette(
     normal: NormalEquations,
     posed: Posed,
-    points: Float[np.ndarray, "n 3"],
+    points: Points,
     modes_at: Callable[[Int[np.ndarray, " r"]], Float32[np.ndarray, "r 3 k"]],
     evidence: Observed,
     sigma: float,
@@ -342,7 +342,7 @@ def add_silhouette(
     return normal.add(jacobian, -amount[rows], weight)
 
 
-def silhouette_losses(points: Float[np.ndarray, "n 3"], evidence: Observed, sigma: float) -> Float[np.ndarray, " n"]:
+def silhouette_losses(points: Points, evidence: Observed, sigma: float) -> Values:
     """Loss of each point of the surface by how far the frame rules it out, in squared sigmas."""
     return robust_square(evidence.violations(points, ROBUST * sigma)[1], sigma, 4 * ROBUST)
 
@@ -436,7 +436,7 @@ class Terms:
 
     known: NormalEquations
     cloud: Rows
-    observed_samples: Float[np.ndarray, "n 3"]
+    observed_samples: Points
     ruled_out: NormalEquations
 
     @cached_property

@@ -20,7 +20,7 @@ from mereo.deformation.moving_least_squares import spread
 from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.residuals import robust_square
 from mereo.geometry.mesh import Segment, area_vectors
-from mereo.geometry.transforms import best_rotations, fit_rigid
+from mereo.geometry.transforms import Points, Vector, best_rotations, fit_rigid
 from mereo.scenes.statistical_model import StatisticalModel
 
 # --- corners, and segments that touch ---------------------------------------------------------------------------------
@@ -114,14 +114,14 @@ class SegmentTurns:
     """
 
     label: int
-    center: Float[np.ndarray, "3"]
-    axis: Float[np.ndarray, "3"]
+    center: Vector
+    axis: Vector
     angles: Float[np.ndarray, " a"]
     plausible: Float[np.ndarray, " a"]
 
     def posed(
         self, model: StatisticalModel, material: Float[np.ndarray, "m 3"]
-    ) -> tuple[Int[np.ndarray, " v"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    ) -> tuple[Int[np.ndarray, " v"], Vector, Vector]:
         """Rows of the segment's material points, and the centre and the axis of its turns in a state."""
         rows = np.flatnonzero(model.labels == self.label)
         T = fit_rigid(model.rest_points[rows], material[rows])
@@ -154,7 +154,7 @@ def find_segment_turns(model: StatisticalModel) -> tuple[SegmentTurns, ...]:
 
 def principal_axes(
     vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+) -> tuple[Vector, Float[np.ndarray, "3 3"]]:
     """Centroid of a surface, and its principal axes as rows."""
     area = np.linalg.norm(area_vectors(vertices, faces), axis=1)
     middle = vertices[faces].mean(axis=1)
@@ -163,9 +163,7 @@ def principal_axes(
     return center, np.linalg.eigh(covariance)[1].T
 
 
-def self_distances(
-    segment: Segment, center: Float[np.ndarray, "3"], axis: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, " a"]:
+def self_distances(segment: Segment, center: Vector, axis: Vector) -> Float[np.ndarray, " a"]:
     """Distance of a segment, turned by each of ``ANGLES``, from itself, in mean distances from the axis."""
     arm = segment.vertices[spread(segment.vertices, 150)] - center
     turned = Rotation.from_rotvec(ANGLES[:, None] * axis).as_matrix()
@@ -179,7 +177,7 @@ def plausibility(
     rotation: Float[np.ndarray, "n s 3 3"],
     index: int,
     neighbors: Collection[int],
-    axis: Float[np.ndarray, "3"],
+    axis: Vector,
     angles: Float[np.ndarray, " a"],
 ) -> Float[np.ndarray, " a"]:
     """``SegmentTurns.plausible`` against that neighbour of a segment against which it turns most; 1 for all if alone.
@@ -204,7 +202,7 @@ def plausibility(
 def left_open(
     model: StatisticalModel,
     material: Float[np.ndarray, "m 3"],
-    observed_samples: Float[np.ndarray, "n 3"],
+    observed_samples: Points,
     sigma: float,
     total_weight: float,
 ) -> Float32[np.ndarray, "m 3 e"]:
@@ -237,9 +235,9 @@ def left_open(
 def _worse(
     segment: Segment,
     angles: Float[np.ndarray, " a"],
-    seen: Float[np.ndarray, "n 3"],
-    center: Float[np.ndarray, "3"],
-    axis: Float[np.ndarray, "3"],
+    seen: Points,
+    center: Vector,
+    axis: Vector,
     sigma: float,
 ) -> Float[np.ndarray, " a"]:
     """By how much more the points seen on a segment are off where it is turned, in the loss of a fit."""

@@ -76,14 +76,11 @@ def answer_candidate(
 
     Takes the arguments of ``answer_frame``.
     """
-    modes = candidate.modes
-    answer = answer_of(seen, model, registrar, candidate, None if modes is None else modes.registration)
-    if registrar is not None and modes is not None:
+    registration = None
+    if registrar is not None and candidate.modes is not None:
         with stage("fit the parameters of the scene"):
-            registration = registrar.finish(modes)
-        if registration is not modes.registration:
-            answer = answer_of(seen, model, registrar, candidate, registration)
-    return answer
+            registration = registrar.finish(candidate.modes)
+    return answer_of(seen, model, registrar, candidate, registration)
 
 
 def answer_of(
@@ -96,7 +93,8 @@ def answer_of(
     """Make the answer of a candidate, and recognize the object in it."""
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
-    doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or None
+    is_open = registration is not None and registration.doubt
+    doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or is_open or None
     recognition = recognize(registration, stated, unseen, model is not None).doubted(doubt)
     used = candidate.encoded
     if registrar is not None and registration is not None:

@@ -142,7 +142,7 @@ def recognize(
 ) -> Recognition:
     """Whether a frame shows the object, in a state that was learned.
 
-    Never true of a fit that is not accepted, and where another state explains the frame alike.
+    Never true of a fit that is not accepted.
 
     Args:
         registration: of the object's model to the frame; None where the network alone answers.
@@ -160,7 +160,7 @@ def recognize(
         sign = "unexplained" if known is True else max(against, key=lambda name: against[name])
         reason = _reason(sign, registration, signs, WORDS[has_weights])
         recognition = replace(recognition, known=known and "unsure", reason=reason)  # refused, or unsure
-    return recognition.doubted(registration.doubt)
+    return recognition
 
 
 # --- reasons ----------------------------------------------------------------------------------------------------------

@@ -33,10 +33,11 @@ from mereo.fitting.problem.gauss_newton import Posed
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, OPEN_SCALE_STD, Problem
 from mereo.fitting.problem.residuals import Surface
 from mereo.fitting.registration.registration import Method, Registration
-from mereo.fitting.uncertainty import LEAST_RADIUS, DrawsOptimum, ModesOptimum, Optimum
+from mereo.fitting.uncertainty import DrawsOptimum, ModesOptimum, Optimum
 from mereo.geometry.brief import listed
 from mereo.geometry.camera import SightLines
 from mereo.geometry.symmetry import describe_symmetries
+from mereo.geometry.transforms import Points
 from mereo.io.cores import limit_blas_threads
 from mereo.io.progress import stage
 from mereo.models.calibration import Calibration, RadiusFactors
@@ -62,11 +63,11 @@ class CloudToFit:
         normals: out of the surface, of a surface that no single camera saw, as ``lines`` say; None where unknown.
     """
 
-    points: Float[np.ndarray, "n 3"]
+    points: Points
     scene_unit: float | None = None
     outliers: Float[np.ndarray, "o 3"] | None = None
     lines: SightLines = UNDECIDED
-    normals: Float[np.ndarray, "n 3"] | None = None
+    normals: Points | None = None
 
     @property
     def kind(self) -> type[Observed]:
@@ -200,7 +201,6 @@ class ModesFit:
             needed=self.problem.accepted,
             optimum=optimum,
             radius_scale=factors.scale_at(misfit),
-            extra_radius=0.0 if factors.scale is None else LEAST_RADIUS,
             alike=1 + len(self.others),
         )
 
@@ -426,6 +426,7 @@ def describe(registration: Registration) -> dict[str, object]:
         "explained": registration.explained,
         "accepted": registration.accepted,
         "residual": registration.residual,
+        "expected_iou": registration.expected_iou,
         "ruled_out": registration.ruled_out,
         "beyond_states": registration.beyond_states,
         "alike": registration.alike,

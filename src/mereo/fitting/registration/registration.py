@@ -5,7 +5,7 @@ from functools import cached_property
 from typing import Any, Literal, SupportsIndex
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from mereo.deformation.maps import newton
@@ -16,7 +16,7 @@ from mereo.geometry.brief import counted
 from mereo.geometry.conventions import LARGEST, check_real
 from mereo.geometry.mesh import SegmentedMesh
 from mereo.geometry.solids import Solids, owned_centroids, signed_distance_and_direction
-from mereo.geometry.transforms import checked_pose, fit_rigid, transform_points
+from mereo.geometry.transforms import Labels, Points, Transform, Values, checked_pose, fit_rigid, transform_points
 from mereo.io.bounds import check_value
 from mereo.scenes.statistical_model import StatisticalModel, following
 
@@ -30,6 +30,10 @@ BELIEVED = 0.95
 """Share of a clean frame's points that a fit must explain to be believed."""
 
 
+RIGHT = 0.75
+"""Intersection over union with the truth from which on an answer is right; what is expected to have less is doubted."""
+
+
 @dataclass(frozen=True, eq=False)
 class Located:
     """Answer of a registration about points of the frame.
@@ -41,10 +45,10 @@ class Located:
         rest: where the point was at rest, scene units; outside, as if it moved along with the nearest segment.
     """
 
-    label: UInt8[np.ndarray, " n"]
-    distance: Float[np.ndarray, " n"]
-    direction: Float[np.ndarray, "n 3"]
-    rest: Float[np.ndarray, "n 3"]
+    label: Labels
+    distance: Values
+    direction: Points
+    rest: Points
 
     def __repr__(self) -> str:
         return f"Located({counted(len(self.label), 'point')}, {int((self.label > 0).sum()):,} in a segment)"
@@ -72,7 +76,6 @@ class Registration:
         optimum: where the fit ended, from which uncertainty and explanations are made on first use; None
             where the registration was read from a file.
         radius_scale: factor of the radii by the weights' calibration of such fits to such frames; None without one.
-        extra_radius: radius that every position has in addition, as ``Uncertainty.extra_radius``; scene units.
         alike: number of different states that a search found to explain the frame alike, this one included.
     """
 
@@ -91,7 +94,6 @@ class Registration:
     needed: float = BELIEVED
     optimum: Optimum | None = None
     radius_scale: float | None = None
-    extra_radius: float = 0.0
     alike: int = 1
 
     def __reduce_ex__(self, protocol: SupportsIndex) -> Any:
@@ -113,15 +115,19 @@ class Registration:
 
     @property
     def doubt(self) -> str | None:
-        """Sentence about other states that explain the frame alike, with what to do; None without any."""
-        if self.optimum is None or not self.optimum.others:
+        """Sentence about a surface that the frame leaves open, with what to do; None where it does not."""
+        if self.expected_iou is None or self.expected_iou >= RIGHT:
             return None
-        apart = np.linalg.norm(np.stack(self.optimum.others) - self.optimum.surface.material, axis=2)
         return (
-            f"{counted(len(apart), 'other state')} would explain the frame nearly as well, with places up to "
-            f"{apart.max() * self.optimum.unit:.3g} away in the frame's unit: take a frame from another side, or of "
-            "more of the object"
+            f"the frame leaves open where its surface is: its IoU with the true one is expected to be "
+            f"{self.expected_iou:.2f} ({self.description}): take a frame from nearer, from another side, or of more of "
+            "the object"
         )
+
+    @property
+    def expected_iou(self) -> float | None:
+        """``Uncertainty.expected_iou``; None where the registration was read from a file."""
+        return None if self.uncertainty is None else self.uncertainty.expected_iou
 
     @cached_property
     def modes_z(self) -> Float[np.ndarray, " k"]:
@@ -139,11 +145,11 @@ class Registration:
         source = self.model.source_frame
         return self.scene_unit * (1.0 if source is None else source.scale)
 
-    def pose(self, rows: Bool[np.ndarray, " m"] | slice = slice(None)) -> Float[np.ndarray, "4 4"]:
+    def pose(self, rows: Bool[np.ndarray, " m"] | slice = slice(None)) -> Transform:
         """Best rigid motion of some material points, of the object's own files in the input's unit, to the frame."""
         return fit_rigid(self.model.source_points(self.scene_unit)[rows], self.material[rows])
 
-    def segment_pose(self, label: int) -> Float[np.ndarray, "4 4"]:
+    def segment_pose(self, label: int) -> Transform:
         """``pose`` of the segment of a label."""
         return self.pose(self.model.labels == label)
 
@@ -162,7 +168,7 @@ class Registration:
         """Segments at rest, for the same queries."""
         return Solids(self.model.rest)
 
-    def to_camera(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
+    def to_camera(self, points: ArrayLike, labels: Labels | None = None) -> Points:
         """Map points of the rest model to the camera frame.
 
         Args:
@@ -178,7 +184,7 @@ class Registration:
             result[rows] = self.model.weights(points[rows], labels[rows])(self.material)
         return result
 
-    def to_rest(self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None) -> Float[np.ndarray, "n 3"]:
+    def to_rest(self, points: ArrayLike, labels: Labels | None = None) -> Points:
         """Inverse of ``to_camera``: where n x 3 points of the camera frame are in the rest model, scene units."""
         points = rows_of_three(points)
         labels = nearest_labels(self.solids, points) if labels is None else labels
@@ -204,11 +210,9 @@ class Registration:
         """How far the true positions may be from the registered ones; None where it was read from a file."""
         if self.optimum is None:
             return None
-        return Uncertainty(self.optimum, self.model, self.radius_scale, self.extra_radius)
+        return Uncertainty(self.optimum, self.model, self.radius_scale)
 
-    def radius95(
-        self, points: ArrayLike, labels: UInt8[np.ndarray, " n"] | None = None, *, at: Place
-    ) -> Float[np.ndarray, " n"] | None:
+    def radius95(self, points: ArrayLike, labels: Labels | None = None, *, at: Place) -> Values | None:
         """Radius around each point that holds its true position with probability 0.95, in the input's unit.
 
         The point is one of the object: that which the registration has at the given position of the camera frame, or
@@ -226,9 +230,7 @@ class Registration:
             return None
         return self.uncertainty.of_rest(*self._at_rest(rows_of_three(points), labels, at))
 
-    def _at_rest(
-        self, points: Float[np.ndarray, "n 3"], labels: UInt8[np.ndarray, " n"] | None, at: Place
-    ) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, " n"]]:
+    def _at_rest(self, points: Points, labels: Labels | None, at: Place) -> tuple[Points, Labels]:
         """Rest positions of points, with the segments that they move along with."""
         if labels is None:
             labels = nearest_labels(self.solids if at == "camera" else self.rest_solids, points)
@@ -261,7 +263,7 @@ class Registration:
         T_registration_fit = fit_rigid(optimum.unit * optimum.posterior.material, self.material)
         return self.uncertainty.explain(place, motion, T_registration_fit)
 
-    def moved(self, T_new_camera: Float[np.ndarray, "4 4"]) -> "Registration":
+    def moved(self, T_new_camera: Transform) -> "Registration":
         """Registration in another frame; raises ``ValueError`` for a transform that is not rigid."""
         return replace(self, material=transform_points(checked_pose(T_new_camera), self.material))
 
@@ -270,7 +272,7 @@ class Registration:
         return tuple(Anchors(index, self.material[index]) for index in self.model.anchors)
 
 
-def rows_of_three(points: ArrayLike) -> Float[np.ndarray, "n 3"]:
+def rows_of_three(points: ArrayLike) -> Points:
     """Points as an array of a row each, also where there is only x, y, z; raises ``ValueError`` for anything else."""
     given = np.asarray(points)
     check_real(given, "the array of points")
@@ -288,7 +290,7 @@ def rows_of_three(points: ArrayLike) -> Float[np.ndarray, "n 3"]:
     return array
 
 
-def nearest_labels(solids: Solids, points: Float[np.ndarray, "n 3"]) -> UInt8[np.ndarray, " n"]:
+def nearest_labels(solids: Solids, points: Points) -> Labels:
     """The segment that holds each point, or else the nearest."""
     labels = solids.label(points)
     outside = np.flatnonzero(labels == 0)
