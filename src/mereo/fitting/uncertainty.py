@@ -506,16 +506,23 @@ class Uncertainty:
         Turns of a segment onto itself (``Posterior.open``) leave its surface where it is.
         """
         posterior = self.posterior
-        mesh = self.model.mesh(posterior.material)
-        # a vertex's area, outwards, is the derivative of the volume
-        area = np.concatenate([moment_gradients(segment, np.zeros(3))[0] for segment in mesh.segments])
-        moved = np.einsum("vip,vi->vp", posterior.motion[: len(area)], area @ posterior.posed.rotation)
-        variance = (moved**2).sum(axis=1) + posterior.residue**2 / 3 * (area**2).sum(axis=1)
-        ways = np.abs(np.einsum("vio,vi->vo", posterior.ways[: len(area)], area))
-        between = MEAN_ABSOLUTE * np.sqrt(variance)[:, None] + np.pad(ways, ((0, 0), (1, 0)))
-        each = np.add.reduceat(between, np.cumsum([0, *self.model.vertex_counts[:-1]]))
-        volumes = np.array([segment.volume for segment in mesh.segments])[:, None]
-        return np.stack([np.broadcast_to(volumes, each.shape), np.minimum(each, 2 * volumes)], axis=1)
+        result = list[Float[np.ndarray, "2 a"]]()
+        first = 0
+        for segment in self.model.mesh(posterior.material).segments:
+            # a vertex's area, outwards, is the derivative of the volume; some stand for all
+            every = slice(None, None, max(1, len(segment.vertices) // OUTLINE))
+            area = moment_gradients(segment, segment.vertices[0])[0]
+            whole = np.linalg.norm(area, axis=1).sum()
+            area = area[every]
+            rows = np.arange(first, first + len(segment.vertices))[every]
+            first += len(segment.vertices)
+            moved = np.einsum("vip,vi->vp", posterior._motion(rows), area @ posterior.posed.rotation)
+            variance = (moved**2).sum(axis=1) + posterior.residue**2 / 3 * (area**2).sum(axis=1)
+            ways = np.abs(np.einsum("vio,vi->vo", posterior.ways[rows], area)).sum(axis=0)
+            between = MEAN_ABSOLUTE * np.sqrt(variance).sum() + np.append(0.0, ways)
+            between *= whole / np.linalg.norm(area, axis=1).sum()
+            result.append(np.stack([np.full_like(between, segment.volume), np.minimum(between, 2 * segment.volume)]))
+        return np.stack(result)
 
     @cached_property
     def segments(self) -> tuple[SegmentUncertainty, ...]:

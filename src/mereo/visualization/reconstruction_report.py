@@ -365,7 +365,9 @@ def _facts(summary: Facts, unit: Unit, verdict: Trust) -> list[str]:
     if source is not None and str(source) != str(summary.get("title")):
         facts.append(f"from {source}")
     if isinstance(radius95, Mapping):
-        facts += [radius_words(radius95, unit), iou_words(_block(summary, "registration")["expected_iou"])]
+        facts.append(radius_words(radius95, unit))
+    if (expected_iou := _number(_block(summary, "registration").get("expected_iou"))) is not None:
+        facts.append(iou_words(expected_iou))
     if spacing is not None:
         facts.append(f"voxels of {rounded(spacing * unit.length_factor)} {unit.length_name}")
     if summary.get("device"):

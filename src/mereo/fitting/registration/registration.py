@@ -119,7 +119,7 @@ class Registration:
         if self.expected_iou is None or self.expected_iou >= RIGHT:
             return None
         return (
-            f"the frame leaves open where its surface is: its IoU with the true one is expected to be "
+            "the frame leaves open where its surface is: its IoU with the true one is expected to be "
             f"{self.expected_iou:.2f} ({self.description}): take a frame from nearer, from another side, or of more of "
             "the object"
         )
