@@ -111,7 +111,7 @@ def test_an_object_at_rest_is_found_to_be_at_rest(model: StatisticalModel, noise
     points = seen(model.rest.transformed(IN_FRONT))
     points = points + default_rng(0).normal(scale=noise, size=points.shape)
     found = fit_cloud(unit * points, model, material, unit)
-    assert found.method == "rest" and found.accepted
+    assert found.method == "rest" and found.accepted and found.optimum.posterior.residue == 0.0
     # a rigid motion of the rest model, and the right one
     apart = [norm(np.diff(places[::50], axis=0), axis=1) for places in (found.material / unit, material)]
     assert_allclose(*apart, atol=1e-6)

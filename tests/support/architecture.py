@@ -124,13 +124,13 @@ MAY_IMPORT = {"torch": ("models/", "cli/tools.py"), "matplotlib": ("io/extras.py
 """The same of libraries that most installations lack: asked for where they are used, with the extra's name."""
 
 BUDGET = {
-    "src/mereo": (304_600, 163),
+    "src/mereo": (304_610, 163),
     "src/mereo_learning": (45_670, 22),
     "src/mereo_objects": (40_010, 28),
     "src/mereo_serving": (10_580, 13),
     "src/mereo_viewer": (11_990, 5),
     "src/mereo_experiments": (11_190, 16),
-    "tests": (294_240, 139),
+    "tests": (294_248, 139),
 }
 """Syntax nodes and files that a folder may have at most. Lines are free: fewer of them are not less to know."""
 

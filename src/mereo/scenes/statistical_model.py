@@ -253,9 +253,12 @@ class StatisticalModel:
         return self.positions(self.library, self.sparse).astype(np.float32)
 
     def around(self, mean: MaterialPoints, modes: Float32[ndarray, "m 3 d"]) -> "StatisticalModel":
-        """Another linear model of the same object, without kept distances; what depends on rest alone is shared."""
+        """Linear model of a state of the same object that is known but for these modes, without kept distances.
+
+        What depends on rest alone is shared.
+        """
         library = np.zeros((0, modes.shape[2]), np.float32)
-        other = replace(self, mean=mean, modes=modes, library=library, pairs=PairDistances.none())
+        other = replace(self, mean=mean, modes=modes, library=library, residue=0.0, pairs=PairDistances.none())
         vars(other).update({name: getattr(self, name) for name in OF_REST})
         return other
 
