@@ -110,7 +110,12 @@ class Outline(NamedTuple):
 
     @property
     def nats(self) -> float:
-        """Logarithm of how much likelier that is of the object than of something else that was taken for it."""
+        """Logarithm of how much likelier that is of the object than of something else that was taken for it.
+
+        An object that would cover nothing in the picture is not what was seen.
+        """
+        if not self.shown:
+            return -np.inf
         independent = EDGE_OFF + 1
         edge = (HIT * self.hits + CREASE * self.creases + MISS * self.misses) / independent
         seen = SEEN * np.log1p(-self.hidden / (self.shown + 1))
@@ -121,8 +126,6 @@ def compare_outline(jumps: Jumps, depth: PixelValues) -> Outline:
     """Compare the rendered ``depth`` of a posed object, 0 where it is not, with an image's."""
     measured, (height, width) = jumps.image.depth, depth.shape
     shown = depth > 0
-    if not shown.any():
-        return Outline()
     step = np.maximum(jumps.step, steepest(jumps.image) * depth)
     edge = shown & ~ndimage.binary_erosion(shown)
     for first, second in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
