@@ -148,8 +148,8 @@ def recording() -> Iterator[Recorder]:
             recorder.add("bent", problem, posed)
         return ranked
 
-    def recorded_poses(problem: Problem, stage: search.SearchRound) -> list[Posed]:
-        poses = screened(problem, stage)
+    def recorded_poses(problem: Problem, screening: search.Screening) -> list[Posed]:
+        poses = screened(problem, screening)
         for posed in poses:
             recorder.add("screened", problem, posed)
         return poses

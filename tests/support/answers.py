@@ -52,7 +52,7 @@ def fit_modes(
     """Fit of the modes from the mean state where a state's material points, in scene units, are."""
     T, _ = model.project(material)
     start = Posed(T[:3, :3], T[:3, 3], np.zeros(model.count))
-    return search_modes(CloudToFit(points, unit, lines=lines), model, starts=[start], rounds=())
+    return search_modes(CloudToFit(points, unit, lines=lines), model, starts=[start], everywhere=False)
 
 
 def fit_cloud(points: ndarray, model: StatisticalModel, material: ndarray, unit: float = 1.0) -> Registration:

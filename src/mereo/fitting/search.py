@@ -2,14 +2,13 @@
 
     cloud, lines of sight, statistical model -search-> the state that explains the frame, and how many explain it alike
 
-1. Rotations, evenly over all, of the mean state, with its visible side on the cloud; rigid steps draw each towards the
-   frame (``Screen``).
+1. Rotations, evenly over all, of some states of the library, with their visible sides on the cloud; rigid steps draw
+   each towards the frame (``Screen``).
 2. The best that differ are bent towards the frame by few points, from wide to narrow.
 3. The best of these are fitted as a frame always is, as long as they may be better or as good.
 4. Unless that explains a clean frame, it is fitted with another side of the object there, as long as that is better.
-5. Where the frame is not explained, the same again from other states of the library.
 
-Poses of a mechanism bend in the first step, from several states, and states near the best of them are tried too.
+Poses of a mechanism bend in the first step, and states near the best of them are tried too.
 
 States that are known or guessed, as by a network, are fitted before.
 """
@@ -47,7 +46,7 @@ from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
 from mereo.fitting.problem.problem import Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, SampledSurface
-from mereo.fitting.problem.segments import corner_positions, diverse_rows, rms_distance
+from mereo.fitting.problem.segments import diverse_rows, rms_distance
 from mereo.geometry.solids import Solids
 from mereo.geometry.transforms import rotation_along, unit_rows
 from mereo.io.cores import cores
@@ -116,6 +115,11 @@ class ShapeTables:
         trees = (cKDTree(samples, balanced_tree=False, compact_nodes=False) for samples in position)
         nearest = [tree.query(low[i] + cell[i] * steps.reshape(-1, 3))[1] for i, tree in enumerate(trees)]
         return cls(z, position, normal, low, cell, np.stack(nearest).astype(np.int32))
+
+    @property
+    def joints(self) -> int:
+        """How many numbers of joints bend a pose: none."""
+        return 0
 
     def looked_up(
         self, state: Int[np.ndarray, "n 1"], points: Float32[np.ndarray, "n p 3"]
@@ -188,6 +192,11 @@ class MechanismTables(ShapeTables):
         }
         return cls(**vars(states), mechanism=mechanism, segments=segments, owner=owner, rest=rest, rest_normal=normal)
 
+    @property
+    def joints(self) -> int:
+        """How many numbers of joints bend a pose."""
+        return len(self.mechanism.free)
+
     def met(self, poses: "Poses", seen: Float32[np.ndarray, "n p 3"]) -> Samples:
         """Samples near points of each pose's model frame, of the segments that come nearest, and its ``places``."""
         T, twists = (part.astype(np.float32) for part in self.mechanism.motions(poses.z))
@@ -211,10 +220,10 @@ class MechanismTables(ShapeTables):
 
     def near(self, pose: "Poses", count: int, rng: np.random.Generator) -> "Poses":
         """Poses of states near one: all joints turned a little, or one of them anywhere, with most of it in place."""
-        joints = len(self.mechanism.free)
+        joints = self.joints
         many = pose.rows(np.zeros(count, dtype=int))
         step, anywhere = rng.standard_normal((2, count, joints))
-        is_single = np.arange(joints) == rng.integers(max(joints, 1), size=(count, 1))
+        is_single = np.arange(joints) == rng.integers(joints, size=(count, 1))
         single = np.where(is_single, anywhere, pose.z)
         little = pose.z + NEAR * step
         z = np.where(np.arange(count)[:, None] % 2, single, little).astype(np.float32)
@@ -661,8 +670,8 @@ def _moved(poses: Poses, matrix: Float[np.ndarray, "n q q"], gradient: Float[np.
 # --- the search -------------------------------------------------------------------------------------------------------
 
 
-class SearchRound(NamedTuple):
-    """Round of the search: medoids of the library (0: the mean state), rotations of each, bent and fitted at most.
+class Screening(NamedTuple):
+    """How many poses are screened: medoids of the library and rotations of each; how many are bent, and fitted at most.
 
     Where there are fewer medoids, as of a rigid object, each has more rotations. ``near`` is how often states of a
     mechanism near the best are tried.
@@ -675,14 +684,8 @@ class SearchRound(NamedTuple):
     near: int = 0
 
 
-FIRST, SECOND = SearchRound(0, 400, 12, 4), SearchRound(12, 200, 24, 6)
-ROUNDS = FIRST, SECOND
-"""Rounds of the search, one after the other while the frame is not explained."""
-
-MECHANISM_ROUNDS = (
-    FIRST._replace(states=SECOND.states, rotations=FIRST.rotations // SECOND.states, bent=SECOND.bent, near=6),
-)
-"""Those of a mechanism (docs/experiments.md, entry 96)."""
+SCREENING = Screening(12, 100, 12, 4, 6)
+"""That of a search (docs/experiments.md, entries 96 and 104)."""
 
 SIGMAS = np.geomspace(0.15, 0.05, 9)
 """The cloud's standard deviation in each rigid step, in half lengths."""
@@ -699,9 +702,6 @@ of them are independent, is known from what the best leaves over alone (docs/exp
 
 SAME, MOST_PLACES = 0.04, 0.95
 """Distance in half lengths up to which two states look the same, and the share of the places that is so near."""
-
-KEPT = 4
-"""Fits that differ, which another problem of the frame begins with."""
 
 TURNED = 3
 """Turned states that are fitted at most."""
@@ -731,14 +731,12 @@ class Trail:
 
     Attributes:
         handicap: misfit by which another hypothesis is likelier before the frame was seen.
-        is_repeated: whether several starts of a round ended in the best state, so that others would, too.
-        turned: the best state when that was turned last, which a round may not have bettered.
+        turned: the best state when that was turned last.
     """
 
     problem: Problem
     handicap: float = 0.0
     fitted: list[ScoredFit] = field(default_factory=list)
-    is_repeated: bool = False
     turned: ScoredFit | None = None
 
     @property
@@ -762,18 +760,15 @@ class Trail:
         is_explained = best.misfit.cloud < FitConfig.explained and not problem.is_noisy
         return is_explained and problem.silhouette_misfit(best.surface) + self.handicap < WHOLE
 
-    def go_on(self, stage: SearchRound, poses: list[Posed]) -> None:
-        """Fit the candidates of a round that may be the best."""
-        ranked = bend_by_few(self.problem, poses, stage.fitted)
+    def fit(self, poses: list[Posed]) -> None:
+        """Fit the candidates that may be the best."""
+        ranked = bend_by_few(self.problem, poses, SCREENING.fitted)
         fitted = list[ScoredFit]()
-        for cost, posed in ranked[: stage.fitted]:
+        for cost, posed in ranked[: SCREENING.fitted]:
             if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=total_misfit).explains(self.problem):
                 break
             fitted.append(fit_from_far(self.problem, posed))
         self.fitted += fitted
-        places = corner_positions(self.problem.model, [fit.posed for fit in (self.best, *fitted)])
-        near = rms_distance(places[1:] - places[0]) < BENT_APART * self.problem.model.half
-        self.is_repeated = int(near.sum()) > 1
 
     def turn(self) -> None:
         """Fit again with another side of the object where the best state lies, as long as that is better.
@@ -801,11 +796,11 @@ class Trail:
         return Trail(problem, 0.0, [heavier]) if heavier.misfit.cloud < HELPS * best.misfit.cloud else None
 
     def in_problem(self, problem: Problem) -> "Trail":
-        """The same from its best states that differ, in another problem of the frame."""
+        """The same from its best states that differ, in another problem of the frame, as many as are fitted at most."""
         states = [scored.posed for scored in sorted(self.fitted, key=total_misfit)]
-        rows = differing(problem, states, BENT_APART)[:KEPT]
+        rows = differing(problem, states, BENT_APART)[: SCREENING.fitted]
         fits = [fit_from_far(problem, states[row]) for row in rows]
-        return Trail(problem, self.handicap, fits, self.is_repeated)
+        return Trail(problem, self.handicap, fits)
 
     def with_shared_noise(self) -> "Trail":
         """The same with all noise that the best fit leaves over, where nothing else explains the frame."""
@@ -843,12 +838,9 @@ class Trail:
 
 
 def search(
-    whole: Problem,
-    partial: Problem | None = None,
-    starts: Sequence[Posed] = (),
-    rounds: Sequence[SearchRound] = ROUNDS,
+    whole: Problem, partial: Problem | None = None, starts: Sequence[Posed] = (), everywhere: bool = True
 ) -> Trail:
-    """Search for the state that explains a frame, first from ``starts``, then in rounds.
+    """Search for the state that explains a frame, first from ``starts``, then, unless these suffice, ``everywhere``.
 
     What explains a clean frame is searched for no further; under noise several states do, of which a start is one.
 
@@ -860,26 +852,20 @@ def search(
         for trail in trails:
             trail.fitted += [fit_from_far(trail.problem, start) for start in starts]
         chosen = likelier(with_left_noise(trails))
-        if not rounds or (chosen.is_explained and not chosen.problem.shares_noise):
+        if not everywhere or (chosen.is_explained and not chosen.problem.shares_noise):
             return chosen.with_heavier_cloud() or chosen.with_shared_noise()
-    screened = trails
-    if isinstance(whole.model, Mechanism):  # its poses take seconds, so that which rules out least says those of both
-        rounds, screened = MECHANISM_ROUNDS[: len(rounds)], trails[-1:]
-    for stage in rounds:
-        poses = (screen_poses(trail.problem, stage) for trail in screened)
-        for trail, each in zip(trails, cycle(poses)):  # screened once it is its turn
-            trail.go_on(stage, each)
-            if trail.is_evident:
-                return trail
-        for trail, other in permutations(trails, 2):  # either may have found what the other has missed
-            trail.fitted.append(refined(trail.problem, other.best.posed))
-        trails = with_left_noise(trails)
-        chosen = likelier(trails)
-        chosen.turn()
-        heavier = chosen.with_heavier_cloud()
-        if chosen.is_explained or chosen.is_repeated or (heavier is not None and heavier.is_explained):
-            break
-    return heavier or chosen.with_shared_noise()
+    # poses of a mechanism take seconds, so that which rules out least says those of both
+    screened = trails[-1:] if isinstance(whole.model, Mechanism) else trails
+    poses = (screen_poses(trail.problem, SCREENING) for trail in screened)
+    for trail, each in zip(trails, cycle(poses)):  # screened once it is its turn
+        trail.fit(each)
+        if trail.is_evident:
+            return trail
+    for trail, other in permutations(trails, 2):  # either may have found what the other has missed
+        trail.fitted.append(refined(trail.problem, other.best.posed))
+    chosen = likelier(with_left_noise(trails))
+    chosen.turn()
+    return chosen.with_heavier_cloud() or chosen.with_shared_noise()
 
 
 def likelier(trails: list[Trail]) -> Trail:
@@ -896,15 +882,16 @@ def with_left_noise(trails: list[Trail]) -> list[Trail]:
     return [trail.in_problem(trail.problem.quieted(noise)) for trail in trails]
 
 
-def screen_poses(problem: Problem, stage: SearchRound) -> list[Posed]:
+def screen_poses(problem: Problem, screening: Screening) -> list[Posed]:
     """Choose diverse poses from which bending goes on."""
-    tables = tables_of(problem.model, stage.states)
+    states, turns, bent, _, near = screening
+    tables = tables_of(problem.model, states)
     screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
-    poses = screen.best(screen.starts(rotations(stage.rotations * max(stage.states, 1) // len(tables.z))), stage.bent)
+    poses = screen.best(screen.starts(rotations(turns * states // len(tables.z))), bent)
     rng = np.random.default_rng(0)
-    for _ in range(stage.near * min(problem.model.count, 1)):
-        near = Poses.of_all([tables.near(poses.rows(np.array([row])), stage.bent, rng) for row in range(len(poses))])
-        poses = screen.differing(Poses.of_all([poses, screen.best(near, stage.bent)]), stage.bent)
+    for _ in range(near * min(tables.joints, 1)):
+        others = Poses.of_all([tables.near(poses.rows(np.array([row])), bent, rng) for row in range(len(poses))])
+        poses = screen.differing(Poses.of_all([poses, screen.best(others, bent)]), bent)
     rotation = Rotation.from_matrix(poses.rotation).as_matrix()
     translation = poses.translation.astype(np.float64)
     return list(map(Posed, rotation, translation, poses.z.astype(np.float64), poses.log_scale.tolist()))

@@ -272,7 +272,8 @@ class ModesOptimum:
         with limit_blas_threads():
             open = [turns_left_open(self.problem, material)]
             open += [] if self.bent is None else [(self.bent - material)[:, :, None]]
-            return Posterior.of(self.terms.total, self.posed, material, tangent, model.residue, open, self.others)
+            residue = model.residue_at(self.posed.z)
+            return Posterior.of(self.terms.total, self.posed, material, tangent, residue, open, self.others)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

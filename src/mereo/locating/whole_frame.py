@@ -26,7 +26,7 @@ from mereo.fitting.registration.answer_frame import (
 )
 from mereo.fitting.registration.recognition import FIT, REFUSED, Signs, known_by
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.search import ROUNDS, SearchRound, screen_poses
+from mereo.fitting.search import Screening, screen_poses
 from mereo.geometry.camera import DepthImage, PixelMask
 from mereo.geometry.conventions import MIN_POINTS, NoFit
 from mereo.geometry.mesh import SegmentedMesh
@@ -41,8 +41,8 @@ from mereo.reconstruction.observation import HOLE_PX, Observation
 from mereo.reconstruction.pipeline import encode_frame
 from mereo.synthesis.depth_sensor import render_depth
 
-QUICK = SearchRound(6, 40, 6, 4)
-"""Round of the search by which a region is looked at."""
+QUICK = Screening(6, 40, 6, 4)
+"""That by which a region is looked at."""
 
 LOOKS, ANSWERS = 12, 3
 """Regions that are looked at, and of these how many are answered, at most."""
@@ -232,10 +232,8 @@ class WholeFrame:
             return place
         return self.place(place.mask, [fit_from_far(problem, first).posed, *others])
 
-    def answered(
-        self, place: Place, model: Trained | None, keep_all: bool, rounds: Sequence[SearchRound]
-    ) -> "PlacedAnswer | None":
-        """Answer to the pixels of a place, by a search in ``rounds``, or without any by a fit from the place's states.
+    def answered(self, place: Place, model: Trained | None, keep_all: bool, everywhere: bool) -> "PlacedAnswer | None":
+        """Answer to the pixels of a place, by a search ``everywhere``, or by a fit from the place's states.
 
         Both begin at the network's guess as well, where there is a network. None where that finds nothing, or something
         that is not at the frame's point.
@@ -244,9 +242,9 @@ class WholeFrame:
         try:
             seen = self.chosen(place)
             encoded = encode_frame(seen.readings(keep_all)[0], registrar.starting_network, seen.frame.axes)
-            states = () if rounds else place.states
+            states = () if everywhere else place.states
             matches = registrar.correspondences(encoded.code)
-            candidate = fit_states(encoded, registrar, self.unit, seen, states, rounds, matches)
+            candidate = fit_states(encoded, registrar, self.unit, seen, states, everywhere, matches)
         except NoFit:
             return None
         assert candidate.modes is not None
@@ -261,7 +259,7 @@ class WholeFrame:
         modes, model = placed.candidate.modes, placed.answer.model
         if modes is None or placed.nats < REFUSED or placed.is_finished:
             return placed
-        again = self.answered(self.place(placed.place.mask, [modes.posed]), model, keep_all, ())
+        again = self.answered(self.place(placed.place.mask, [modes.posed]), model, keep_all, False)
         best = placed if again is None else max(placed, again, key=lambda each: each.score)
         answer = answer_candidate(best.seen, model, self.registrar, best.candidate)
         assert answer.registration is not None
@@ -376,17 +374,17 @@ def answers_in(
     """Answers at the most evident places of a whole frame, until so many at ``most`` are evident themselves.
 
     First from the states of the quick looks and a network's guess, then, where a better state may win more than the
-    best has, by a round of the search, which takes longer. Places where an evident answer explains most of the pixels
+    best has, by a search, which takes longer. Places where an evident answer explains most of the pixels
     are left out, and so are those where a fit finds nothing. Parameters of the object's scene are fitted where it is
     evident (``WholeFrame.finished``).
     """
     places = islice(frame.places(), ANSWERS + most - 1)
     waiting: Iterable[Place] = map(frame.sharpened, places)  # each once it is its turn
     taken = np.zeros_like(frame.jumps.image.valid)
-    for rounds in ((), ROUNDS[:1]):
+    for everywhere in (False, True):
         answers = list[PlacedAnswer]()
         for place in waiting:
-            if frame.is_among(taken, place.mesh) or not (placed := frame.answered(place, model, keep_all, rounds)):
+            if frame.is_among(taken, place.mesh) or not (placed := frame.answered(place, model, keep_all, everywhere)):
                 continue
             placed = frame.finished(placed, keep_all) if placed.is_evident else placed
             yield placed

@@ -26,6 +26,7 @@ from mereo.scenes.rest_pose import rest_frame
 from mereo.scenes.scene import Scene, State
 from mereo.scenes.seeds import example_rng
 from mereo.scenes.statistical_model import (
+    WIDER,
     MaterialPoints,
     PairDistances,
     StatisticalModel,
@@ -121,10 +122,6 @@ def scene_model(scene: Scene, count: int = STATES, seed: int = STATES_SEED, *, q
 
 CHECKED = 20
 """States of an elastic solid whose distance from its linear model is the model's residue."""
-
-
-WIDER = 2.0
-"""Motion of an elastic solid in its model, in that of the states that are drawn: real ones may go farther."""
 
 
 def elastic_model(

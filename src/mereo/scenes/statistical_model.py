@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Float32, Int, UInt8
 from numpy import ndarray
-from numpy.linalg import inv, solve
+from numpy.linalg import inv, norm, solve
 from numpy.random import default_rng
 from scipy.special import ndtri
 
@@ -125,6 +125,10 @@ OF_REST: Names = (
 
 PROJECTIONS = 5
 """Rounds of alignment and least squares that express a state in modes."""
+
+
+WIDER = 2.0
+"""Motion of an elastic solid in its model, in that of the states that are drawn: real ones may go farther."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -275,6 +279,15 @@ class StatisticalModel:
     def tangent(self, z: PerMode, rows: Rows = slice(None)) -> Float32[ndarray, "r 3 k"]:
         """Motion of some material points for one standard deviation of each mode, at a state: everywhere the same."""
         return self.modes[rows]
+
+    def residue_at(self, z: PerMode) -> float:
+        """Root mean square distance of a state of these coefficients from what they express, scene units.
+
+        That of a solid grows with the square of how far it is bent: its modes are how it moves from rest.
+        """
+        if not self.is_normal or not self.count:
+            return self.residue
+        return self.residue * float(WIDER * norm(self.motion * z) / norm(self.motion)) ** 2
 
     @property
     def registered(self) -> "StatisticalModel":

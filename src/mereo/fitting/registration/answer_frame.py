@@ -21,7 +21,7 @@ from mereo.fitting.registration.answer import Answer, Candidate
 from mereo.fitting.registration.recognition import FEATURELESS, Recognition, recognize
 from mereo.fitting.registration.register import CloudToFit, ModesFit, Registrar
 from mereo.fitting.registration.registration import Registration
-from mereo.fitting.search import MECHANISM_ROUNDS, ROUNDS, Screen, SearchRound, rotations, search, tables_of
+from mereo.fitting.search import SCREENING, Screen, rotations, search, tables_of
 from mereo.geometry.camera import SightLines
 from mereo.geometry.conventions import NoFit
 from mereo.geometry.transforms import fit_rigid, transform_points
@@ -179,7 +179,7 @@ def _searched(reading: Reading, registrar: Registrar, scene_unit: float | None, 
     if seen.initial_pose is None or scene_unit is None:
         return fit_states(frame, registrar, scene_unit, seen, matches=registrar.correspondences(frame.code))
     starts = initial_states(frame.T_camera_input @ seen.initial_pose, registrar.states, scene_unit)
-    return replace(fit_states(frame, registrar, scene_unit, seen, starts, ()), located_by="pose")
+    return replace(fit_states(frame, registrar, scene_unit, seen, starts, everywhere=False), located_by="pose")
 
 
 def fit_states(
@@ -188,20 +188,20 @@ def fit_states(
     scene_unit: float | None,
     seen: Observation,
     states: Sequence[Posed] = (),
-    rounds: Sequence[SearchRound] = ROUNDS,
+    everywhere: bool = True,
     matches: Correspondences | None = None,
 ) -> Candidate:
     """Candidate of one hypothesis by ``search_modes``; raises ``NoFit`` where that cannot start."""
     cloud = cloud_to_fit(frame, seen.lines, scene_unit)
     check_size(frame, registrar.model, scene_unit)
-    modes = search_modes(cloud, registrar.states, registrar.config, states, rounds, matches)
+    modes = search_modes(cloud, registrar.states, registrar.config, states, everywhere, matches)
     return Candidate(frame, replace(modes, calibration=registrar.calibration))
 
 
 def initial_states(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalModel, scene_unit: float) -> list[Posed]:
     """States of the model with a pose as ``Result.pose``, in scene units: at rest, and those of a mechanism."""
     placed = transform_points(T_camera_model, model.source_points(scene_unit)) / scene_unit
-    states = [model.rest_z, *(tables_of(model, MECHANISM_ROUNDS[0].states).z if isinstance(model, Mechanism) else ())]
+    states = [model.rest_z, *(tables_of(model, SCREENING.states).z if isinstance(model, Mechanism) else ())]
     poses = [fit_rigid(model.material(z), placed) for z in states]
     return [Posed(T[:3, :3], T[:3, 3], z.astype(float)) for T, z in zip(poses, states, strict=True)]
 
@@ -260,13 +260,13 @@ def search_modes(
     model: StatisticalModel,
     config: FitConfig = FitConfig(),  # noqa: B008 (frozen)
     starts: Sequence[Posed] = (),
-    rounds: Sequence[SearchRound] = ROUNDS,
+    everywhere: bool = True,
     matches: Correspondences | None = None,
 ) -> ModesFit:
-    """Fit the modes to a cloud by a search of some rounds; where it leaves open what lies around it, the fits decide.
+    """Fit the modes to a cloud by a search; where it leaves open what lies around it, the fits decide.
 
     It begins at ``starts`` that are known roughly, and where a network has the object (``matches``, in the cloud's
-    unit). Where the object is held, it keeps the first start's pose.
+    unit), and goes on ``everywhere``. Where the object is held, it keeps the first start's pose.
     """
     started = time.perf_counter()
     with limit_blas_threads():
@@ -280,7 +280,7 @@ def search_modes(
             whole, guess = fit_correspondences(whole, matches, unit)
             starts = (*starts, guess)
         partial = replace(whole, evidence=replace(evidence, other_lines="unknown")) if is_open else None
-        trail = search(whole, partial, starts, rounds)
+        trail = search(whole, partial, starts, everywhere)
         problem, modes = trail.problem, trail.best
         rest = resting(problem, modes)
     seconds = time.perf_counter() - started
