@@ -18,7 +18,7 @@ from mereo.fitting.config import FitConfig
 from mereo.fitting.modes import bend_by_few
 from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import KNOWN_SCALE_STD, Problem
-from mereo.fitting.search import SCREENING, screen_poses, search
+from mereo.fitting.search import FITTED, SCREENING, screen_poses, search
 from mereo.reconstruction.observation import Observation, find_object
 from mereo.scenes.random_states import kept_model
 from mereo.scenes.registry import load_scene
@@ -62,7 +62,7 @@ def main(options: Options) -> None:
     evidence = Evidence.of(seen.cloud.points, lines=seen.lines)
     problem = Problem(model, evidence, KNOWN_SCALE_STD, FitConfig())
     rigid = screen_poses(problem, SCREENING)
-    bent = bend_by_few(problem, rigid, SCREENING.fitted)
+    bent = bend_by_few(problem, rigid, FITTED)
     found = search(problem)
     states = (rigid[-1], rigid[0], bent[0][1], found.best.posed)
     points = evidence.points

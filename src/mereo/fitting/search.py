@@ -671,7 +671,7 @@ def _moved(poses: Poses, matrix: Float[np.ndarray, "n q q"], gradient: Float[np.
 
 
 class Screening(NamedTuple):
-    """How many poses are screened: medoids of the library and rotations of each; how many are bent, and fitted at most.
+    """How many poses are screened: medoids of the library and rotations of each; and how many are bent.
 
     Where there are fewer medoids, as of a rigid object, each has more rotations. ``near`` is how often states of a
     mechanism near the best are tried.
@@ -680,12 +680,14 @@ class Screening(NamedTuple):
     states: int
     rotations: int
     bent: int
-    fitted: int
     near: int = 0
 
 
-SCREENING = Screening(12, 100, 12, 4, 6)
+SCREENING = Screening(12, 100, 12, 6)
 """That of a search (docs/experiments.md, entries 96 and 104)."""
+
+FITTED = 4
+"""Candidates that are fitted at most."""
 
 SIGMAS = np.geomspace(0.15, 0.05, 9)
 """The cloud's standard deviation in each rigid step, in half lengths."""
@@ -762,9 +764,9 @@ class Trail:
 
     def fit(self, poses: list[Posed]) -> None:
         """Fit the candidates that may be the best."""
-        ranked = bend_by_few(self.problem, poses, SCREENING.fitted)
+        ranked = bend_by_few(self.problem, poses, FITTED)
         fitted = list[ScoredFit]()
-        for cost, posed in ranked[: SCREENING.fitted]:
+        for cost, posed in ranked[:FITTED]:
             if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=total_misfit).explains(self.problem):
                 break
             fitted.append(fit_from_far(self.problem, posed))
@@ -798,7 +800,7 @@ class Trail:
     def in_problem(self, problem: Problem) -> "Trail":
         """The same from its best states that differ, in another problem of the frame, as many as are fitted at most."""
         states = [scored.posed for scored in sorted(self.fitted, key=total_misfit)]
-        rows = differing(problem, states, BENT_APART)[: SCREENING.fitted]
+        rows = differing(problem, states, BENT_APART)[:FITTED]
         fits = [fit_from_far(problem, states[row]) for row in rows]
         return Trail(problem, self.handicap, fits)
 
@@ -884,7 +886,7 @@ def with_left_noise(trails: list[Trail]) -> list[Trail]:
 
 def screen_poses(problem: Problem, screening: Screening) -> list[Posed]:
     """Choose diverse poses from which bending goes on."""
-    states, turns, bent, _, near = screening
+    states, turns, bent, near = screening
     tables = tables_of(problem.model, states)
     screen = Screen.of(tables, problem.evidence, problem.model.half, problem.is_scale_open)
     poses = screen.best(screen.starts(rotations(turns * states // len(tables.z))), bent)

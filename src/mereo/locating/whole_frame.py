@@ -26,7 +26,7 @@ from mereo.fitting.registration.answer_frame import (
 )
 from mereo.fitting.registration.recognition import FIT, REFUSED, Signs, known_by
 from mereo.fitting.registration.register import Registrar
-from mereo.fitting.search import Screening, screen_poses
+from mereo.fitting.search import FITTED, Screening, screen_poses
 from mereo.geometry.camera import DepthImage, PixelMask
 from mereo.geometry.conventions import MIN_POINTS, NoFit
 from mereo.geometry.mesh import SegmentedMesh
@@ -41,7 +41,7 @@ from mereo.reconstruction.observation import HOLE_PX, Observation
 from mereo.reconstruction.pipeline import encode_frame
 from mereo.synthesis.depth_sensor import render_depth
 
-QUICK = Screening(6, 40, 6, 4)
+QUICK = Screening(6, 40, 6)
 """That by which a region is looked at."""
 
 LOOKS, ANSWERS = 12, 3
@@ -186,7 +186,7 @@ class WholeFrame:
     def look(self, mask: PixelMask) -> Place:
         """Place of a region, with some states that are quickly fitted to it."""
         problem = self.problem(part_of(self.thin, mask))
-        states = bend_by_few(problem, screen_poses(problem, QUICK), QUICK.fitted)
+        states = bend_by_few(problem, screen_poses(problem, QUICK), FITTED)
         ranked = sorted((self.place(mask, [posed]) for _, posed in states), key=lambda place: -place.outline.nats)
         return replace(ranked[0], states=tuple(place.states[0] for place in ranked))
 
