@@ -30,7 +30,7 @@ from mereo.fitting.registration.answer_frame import in_registered_unit, search_h
 from mereo.fitting.registration.register import ModesFit, Registrar
 from mereo.fitting.search import screen_poses
 from mereo.fitting.uncertainty import ModesOptimum
-from mereo.geometry.camera import PointCloud, SharedNoise
+from mereo.geometry.camera import PointCloud, SharedNoise, SightLines
 from mereo.geometry.conventions import NoFit
 from mereo.models.model import Model
 from mereo.models.weights import load_model
@@ -301,5 +301,6 @@ def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:
     slopes = points[:, :2] / points[:, 2:]
     corner = np.append(slopes.max(axis=0) + 0.2, 1.0)
     vertices = np.array([corner * 50.0, corner * 150.0])
+    unknown = SightLines.of_cloud().with_unknown(corner[None] * 300.0)
     assert (Evidence.of(points).violations(vertices, 0.5)[1] > 0).all()
-    assert (Evidence.of(points, corner[None] * 300.0).violations(vertices, 0.5)[1] == 0).all()
+    assert (Evidence.of(points, lines=unknown).violations(vertices, 0.5)[1] == 0).all()

@@ -268,8 +268,7 @@ class BackgroundSearch:
     def start(self, frame: TrackedFrame) -> None:
         """Search a frame, unless one is being searched, or was and has not been taken."""
         if self._running is None:
-            executor = self._thread if self.executor is None else self.executor
-            self._running = frame, executor.submit(self.find, frame)
+            self._running = frame, (self.executor or self._thread).submit(self.find, frame)
 
     def take(self) -> tuple[TrackedFrame, Candidate] | None:
         """The searched frame and its best candidate, which may not explain it; None where there is none, or not yet.
@@ -369,7 +368,7 @@ class Tracker:
         started = time.perf_counter()
         frame = TrackedFrame(seen, time_s, scene_unit, keep_all, scene)
         tracked, why = self._tracked(self._track, frame, self.config.longest_s)
-        if tracked is not None and not self._doubt(tracked):
+        if tracked is not None and not why:
             return self._gone_on(frame, tracked, started)
         if not self._has_begun and (alone := self._by_itself(frame, started)) is not None:
             return alone
@@ -379,10 +378,10 @@ class Tracker:
             again = self._searched(frame)  # some executors have done it now
         if again is not None:
             return self._gone_on(frame, again, started, "found")
-        return self._lost(frame, why if tracked is None else self._doubt(tracked), started)
+        return self._lost(frame, why, started)
 
     def _tracked(self, track: Track | None, frame: TrackedFrame, longest_s: float) -> "tuple[_Tracked | None, str]":
-        """Fit the frame from an earlier state; None, and why, without one that leads to it."""
+        """Fit the frame from an earlier state, and what speaks against that; None without one that leads to it."""
         seen, time_s = frame.seen, frame.time_s
         if track is None or seen.frame.axes != self._axes:
             return None, "nothing explains what is seen"
@@ -399,7 +398,7 @@ class Tracker:
             return None, f"{counted(int(keep.sum()), 'point')} of at least {MIN_POINTS} lie near where it was expected"
         lines = seen.lines.transformed(self._T_camera_input)
         kept = cloud.rows(keep)
-        near = CloudToFit(kept.points, outliers=points[~keep], lines=lines, normals=kept.normals)
+        near = CloudToFit(kept.points, lines=lines.with_unknown(points[~keep]), normals=kept.normals)
 
         def fit(config: TrackConfig) -> _Tracked:
             fitted, after = next_fit(track, near, time_s, config)
@@ -408,7 +407,7 @@ class Tracker:
         tracked = fit(self.config)
         if not tracked.fitted.registration.accepted:  # it may have moved far
             tracked = max(tracked, fit(self.config.patient), key=lambda fit_: fit_.score)
-        return tracked, ""
+        return tracked, self._doubt(tracked)
 
     def _searched(self, frame: TrackedFrame) -> "_Tracked | None":
         """Fit the frame from the state that a search has found in an earlier one; None where that explains none."""
@@ -419,8 +418,8 @@ class Tracker:
         self._T_camera_input, self._axes = candidate.encoded.T_camera_input, earlier.seen.frame.axes
         begun = _Tracked.of_frame(candidate, earlier.time_s, self.config, self.registrar.config)
         area = 0.0 if self._track is None else self._track.area
-        tracked, _ = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
-        if tracked is not None and not self._doubt(tracked):
+        tracked, why = self._tracked(replace(begun.track, area=max(area, begun.track.area)), frame, np.inf)
+        if tracked is not None and not why:
             self._located_by = "search"
             return tracked
         self._T_camera_input, self._axes = before

@@ -279,6 +279,10 @@ class SightLines:
         """Lines of sight around a bare cloud, all of one kind, or of an undecided one."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), other_lines)
 
+    def with_unknown(self, points: Points) -> "SightLines":
+        """The same with nothing known along the lines of sight to further points."""
+        return replace(self, unknown=np.concatenate([points, self.unknown]))
+
     def transformed(self, T_new_old: Transform) -> "SightLines":
         """Lines of sight in another frame, whose origin is the camera as well."""
         past, unknown = (transform_points(T_new_old, points) for points in (self.past, self.unknown))

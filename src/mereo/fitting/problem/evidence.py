@@ -352,7 +352,6 @@ class Evidence(ObservedPoints):
     def of(
         cls,
         points: Points,
-        outliers: Float[np.ndarray, "d 3"] | None = None,
         observed_samples: int = OBSERVED_SAMPLES,
         lines: SightLines = UNDECIDED,
         normals: Points | None = None,
@@ -360,13 +359,12 @@ class Evidence(ObservedPoints):
     ) -> "Evidence":
         """Prepare a cloud, with so many ``observed_samples`` at most; its lines of sight start at the origin.
 
-        Those of ``outliers`` rule nothing out. ``lines`` says what is known around the cloud; where it leaves that
-        open, all lines of sight around the cloud went past the object. Denser clouds are averaged to ``most`` points;
-        ``normals`` are not looked at: a camera's points have those of their neighbours.
+        ``lines`` says what is known around the cloud; where it leaves that open, all lines of sight around the cloud
+        went past the object. Denser clouds are averaged to ``most`` points; ``normals`` are not looked at: a camera's
+        points have those of their neighbours.
         """
         points = means_along_sight(points, most)
-        unknown = lines.unknown if outliers is None else np.concatenate([outliers, lines.unknown])
-        along = lines_along(points, unit_rows(unknown))
+        along = lines_along(points, unit_rows(lines.unknown))
         past = PastLines.of(lines.past, along["pitch"])
         other_lines = lines.other_lines or "past"
         chosen = spread(points, observed_samples)
@@ -581,13 +579,12 @@ class SurfaceEvidence(ObservedPoints):
     def of(
         cls,
         points: Points,
-        outliers: Float[np.ndarray, "d 3"] | None = None,
         observed_samples: int = OBSERVED_SAMPLES,
         lines: SightLines = UNDECIDED,
         normals: Points | None = None,
         most: int = MOST_POINTS,
     ) -> "SurfaceEvidence":
-        """Prepare a surface, of which some ``most`` points are kept; ``outliers`` and ``lines`` say nothing of it.
+        """Prepare a surface, of which some ``most`` points are kept; ``lines`` say nothing of it.
 
         Without ``normals`` these are estimated from the points, and their signs do not count.
         """

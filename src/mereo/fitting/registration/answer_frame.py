@@ -208,11 +208,9 @@ def initial_states(T_camera_model: Float[np.ndarray, "4 4"], model: StatisticalM
 
 def cloud_to_fit(frame: EncodedFrame, lines: SightLines, scene_unit: float | None) -> CloudToFit:
     """Cloud that one hypothesis takes for the object's; ``lines`` are those around it, in the frame's axes."""
-    dropped = frame.reading.whole.points[~frame.reading.keep]
-    outliers = transform_points(frame.T_camera_input, dropped) if len(dropped) else None
-    lines = lines.transformed(frame.T_camera_input)
-    seen = frame.seen
-    return CloudToFit(seen.points, scene_unit, outliers, lines, seen.normals)
+    reading, seen = frame.reading, frame.seen
+    lines = lines.with_unknown(reading.whole.points[~reading.keep]).transformed(frame.T_camera_input)
+    return CloudToFit(seen.points, scene_unit, lines, seen.normals)
 
 
 def check_size(frame: EncodedFrame, model: StatisticalModel, scene_unit: float | None) -> None:

@@ -58,14 +58,12 @@ class CloudToFit:
     Attributes:
         points: observed points of the object.
         scene_unit: length of a scene unit in the cloud's unit; found together with the pose where None.
-        outliers: points that were left out: along their lines of sight nothing is known.
         lines: what is known of the lines of sight around the cloud.
         normals: out of the surface, of a surface that no single camera saw, as ``lines`` say; None where unknown.
     """
 
     points: Points
     scene_unit: float | None = None
-    outliers: Float[np.ndarray, "o 3"] | None = None
     lines: SightLines = UNDECIDED
     normals: Points | None = None
 
@@ -76,9 +74,7 @@ class CloudToFit:
 
     def evidence(self, unit: float, observed_samples: int = OBSERVED_SAMPLES, most: int = MOST_POINTS) -> Observed:
         """Evidence in scene units, of which one has this length in the cloud's unit; the numbers are its most."""
-        outliers = None if self.outliers is None else self.outliers / unit
-        lines = self.lines.scaled(1 / unit)
-        return self.kind.of(self.points / unit, outliers, observed_samples, lines, self.normals, most)
+        return self.kind.of(self.points / unit, observed_samples, self.lines.scaled(1 / unit), self.normals, most)
 
     @property
     def scale_std(self) -> float:
