@@ -39,7 +39,7 @@ from mereo.scenes.statistical_model import StatisticalModel
 LEVEL = 0.95
 """Probability with which a true position lies within a radius, and a true number in an interval."""
 
-WITHIN = float(norm.interval(LEVEL)[1])
+WITHIN = float(max(norm.interval(LEVEL)))
 """Standard deviations of one Gaussian number on either side that hold it with this probability: 1.96."""
 
 MEAN_ABSOLUTE = float(norm.expect(np.abs))

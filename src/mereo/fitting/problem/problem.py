@@ -406,7 +406,7 @@ SIGMAS = 1.5
 NOISES = 3.0
 """Distance, in noises, up to which a point of a noisy frame lies on the surface where a fit is to be believed."""
 
-USUAL = float(norm.expect(lambda offset: robust_square(np.atleast_1d(offset), SIGMAS)[0]))
+USUAL = float(norm.expect(lambda offset: robust_square(np.atleast_1d(offset), SIGMAS).item()))
 """Misfit of a cloud of which normal numbers are left over."""
 
 CLEARINGS = 6

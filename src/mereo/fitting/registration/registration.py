@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from mereo.deformation.maps import newton
 from mereo.deformation.moving_least_squares import Anchors
+from mereo.fitting.config import FitConfig
 from mereo.fitting.draws.playback import Drawn
 from mereo.fitting.uncertainty import AT_ONCE, Explanation, Optimum, Uncertainty
 from mereo.geometry.brief import counted
@@ -26,7 +27,7 @@ Method = Literal["rest", "modes", "draws"]
 Place = Literal["camera", "rest"]
 """Frame of a point: the camera's, in the input's unit, or the rest model's, in scene units."""
 
-BELIEVED = 0.95
+BELIEVED = FitConfig.accepted
 """Share of a clean frame's points that a fit must explain to be believed."""
 
 
