@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 from answers import answer_to
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from scipy.spatial import cKDTree
@@ -123,11 +124,11 @@ def registrar() -> Registrar:
 
 
 @pytest.fixture(scope="module")
-def points(cloud: PointCloud) -> np.ndarray:
+def points(cloud: PointCloud) -> ndarray:
     return cloud.points
 
 
-def with_rim(points: np.ndarray) -> np.ndarray:
+def with_rim(points: ndarray) -> ndarray:
     """The points and pieces of a wall behind, as a mask lets them in that is two pixels too wide in six places."""
     slopes = points[:, :2] / points[:, 2:]
     pitch = np.sqrt(np.ptp(slopes, axis=0).prod() / len(slopes))
@@ -138,11 +139,11 @@ def with_rim(points: np.ndarray) -> np.ndarray:
     return np.concatenate([points, np.column_stack([rim, np.ones(len(rim))]) * (1.4 * points[:, 2].max())])
 
 
-def fitted(registrar: Registrar, points: np.ndarray, keep_all: bool = False, unit: float = 1.0) -> Candidate:
+def fitted(registrar: Registrar, points: ndarray, keep_all: bool = False, unit: float = 1.0) -> Candidate:
     return search_hypotheses(observe(PointCloud(points)), registrar, keep_all, unit)
 
 
-def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: np.ndarray) -> None:
+def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: ndarray) -> None:
     clean, found = fitted(registrar, points), fitted(registrar, with_rim(points))
     assert clean.hypothesis.dropped == 0
     assert not found.hypothesis.keep[len(points) :].any() and found.hypothesis.keep[: len(points)].mean() > 0.99
@@ -152,20 +153,20 @@ def test_strays_are_left_out_and_all_else_is_kept(registrar: Registrar, points: 
         fitted(registrar, with_rim(points), keep_all=True)
 
 
-def test_an_answer_says_which_points_it_is_of(registrar: Registrar, points: np.ndarray) -> None:
+def test_an_answer_says_which_points_it_is_of(registrar: Registrar, points: ndarray) -> None:
     found = answer_to(with_rim(points), registrar.network, registrar, 24, label_points=True, scene_unit=1.0)
     assert found.reconstruction.observed is not None
     assert len(found.reconstruction.observed.labels) == len(found.reconstruction.reading.cloud) < len(with_rim(points))
     assert found.seen.cloud is found.reconstruction.reading.cloud and found.seen.steps[-1].name == "strays"
 
 
-def noisy(points: np.ndarray, std: float) -> np.ndarray:
+def noisy(points: ndarray, std: float) -> ndarray:
     noise = default_rng(0).normal(scale=std, size=(len(points), 1))
     return points + noise * points / norm(points, axis=1)[:, None]
 
 
 @pytest.mark.slow
-def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: np.ndarray) -> None:
+def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: ndarray) -> None:
     clean, found = (fitted(registrar, cloud).modes for cloud in (points, noisy(points, 0.4)))
     assert clean.problem.cloud_sigma == FitConfig.cloud_sigma and not clean.problem.is_noisy
     before, after = (each.problem.evidence.points for each in (clean, found))
@@ -179,7 +180,7 @@ def test_a_noisy_frame_is_fitted_by_its_own_noise(registrar: Registrar, points: 
 
 
 def test_the_noise_left_is_what_points_have_alone_and_as_much_as_neighbours_share_around_the_object(
-    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    registrar: Registrar, points: ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What a wrong state leaves over beside that is none: its neighbours share it."""
     modes = fitted(registrar, points).modes
@@ -192,13 +193,13 @@ def test_the_noise_left_is_what_points_have_alone_and_as_much_as_neighbours_shar
         assert problem.left_noise(surface) == pytest.approx(expected, rel=0.1)
 
 
-def test_the_first_noise_is_what_the_cloud_shows(points: np.ndarray) -> None:
+def test_the_first_noise_is_what_the_cloud_shows(points: ndarray) -> None:
     calm, rough = (Evidence.of(cloud) for cloud in (points, noisy(points, 0.4)))
     assert calm.noise < CLEAN and 0.3 < rough.noise < 0.5
     assert replace(rough, shared_noise=SharedNoise(0.3)).noise == pytest.approx(np.hypot(rough.noise, 0.3))
 
 
-def test_what_neighbours_share_is_no_noise_of_points(points: np.ndarray) -> None:
+def test_what_neighbours_share_is_no_noise_of_points(points: ndarray) -> None:
     """An offset of all points, or of half of them, is the fit's; what each has for itself is the camera's."""
     around = Evidence.of(points).around
     rng = default_rng(0)
@@ -218,7 +219,7 @@ def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not()
     assert not is_normal(np.where(rng.random(2700) < 0.1, 0.6, windows))
 
 
-def plate(pixels: int = 64) -> np.ndarray:
+def plate(pixels: int = 64) -> ndarray:
     """Points of a plate, a pixel each, row by row."""
     line = 0.3 * (np.arange(pixels) - pixels / 2)
     u, v = np.meshgrid(line, line)
@@ -240,7 +241,7 @@ def test_what_neighbours_share_leaves_a_fit_as_unsure_as_fewer_points() -> None:
 
 
 def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_share_their_errors(
-    registrar: Registrar, points: np.ndarray, monkeypatch: pytest.MonkeyPatch
+    registrar: Registrar, points: ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     modes = fitted(registrar, points).modes
     problem = modes.problem.with_noise(0.4)
@@ -257,7 +258,7 @@ def test_a_noisy_cloud_is_worth_no_more_than_its_points_and_less_where_they_shar
     assert 0.3 * count < weights[0] <= 2.25 * count * (1 + 1e-9) and weights[1] < 0.3 * weights[0]
 
 
-def test_what_neighbours_share_is_told_from_what_points_have_alone(registrar: Registrar, points: np.ndarray) -> None:
+def test_what_neighbours_share_is_told_from_what_points_have_alone(registrar: Registrar, points: ndarray) -> None:
     """A smooth error that is known around the object is no noise of points, and leaves the object as unsure."""
     modes = fitted(registrar, points).modes
     evidence = replace(modes.problem.evidence, shared_noise=SharedNoise(0.4, 0.05, 0.001))
@@ -271,7 +272,7 @@ def test_what_neighbours_share_is_told_from_what_points_have_alone(registrar: Re
     assert 0.1 < norm(forward) < 0.6
 
 
-def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: np.ndarray) -> None:
+def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: ndarray) -> None:
     found = fitted(registrar, noisy(points, 0.4)).modes
     assert found is not None and found.problem.is_noisy
     problem = found.problem
@@ -281,7 +282,7 @@ def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registra
     assert not problem.with_noise(0.0).explained(9.0, found.surface, 0.1)
 
 
-def test_constants_follow_the_noise_and_end(registrar: Registrar, points: np.ndarray) -> None:
+def test_constants_follow_the_noise_and_end(registrar: Registrar, points: ndarray) -> None:
     problem = fitted(registrar, points).modes.problem
     config = problem.config
 
@@ -296,7 +297,7 @@ def test_constants_follow_the_noise_and_end(registrar: Registrar, points: np.nda
     assert constants(99.0)[0] == pytest.approx(SIGMAS * largest, rel=0.02)
 
 
-def test_doubtful_points_rule_nothing_out(points: np.ndarray) -> None:
+def test_doubtful_points_rule_nothing_out(points: ndarray) -> None:
     """A vertex along the line of sight of a dropped point is neither outside the silhouette nor in free space."""
     slopes = points[:, :2] / points[:, 2:]
     corner = np.append(slopes.max(axis=0) + 0.2, 1.0)

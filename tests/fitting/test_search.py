@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from fit_cases import seen
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -53,11 +54,11 @@ def state(model: StatisticalModel, index: int) -> Posed:
     return Posed(turn, FAR - turn @ model.mean.mean(axis=0), model.library[index].astype(np.float64))
 
 
-def view(model: StatisticalModel, posed: Posed) -> np.ndarray:
+def view(model: StatisticalModel, posed: Posed) -> ndarray:
     return seen(model.mesh(posed.place(model.material(posed.z))))
 
 
-def cut(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+def cut(points: ndarray, share: float) -> tuple[ndarray, ndarray]:
     """Points that are left where something on the right hides a share of them, and the lines of sight to that."""
     slope = points[:, 0] / points[:, 2]
     limit = np.quantile(slope, 1 - share)
@@ -65,7 +66,7 @@ def cut(points: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
     return points[slope < limit], 50.0 * np.stack([x.ravel(), y.ravel(), np.ones(x.size)], axis=1)
 
 
-def off(model: StatisticalModel, material: np.ndarray, posed: Posed) -> float:
+def off(model: StatisticalModel, material: ndarray, posed: Posed) -> float:
     true = posed.place(model.material(posed.z))
     return float(np.sqrt(((material - true) ** 2).sum(axis=1).mean()) / model.half)
 
@@ -219,7 +220,7 @@ def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(
     assert said(0.9) == 0
 
 
-def all_around(model: StatisticalModel, posed: Posed, std: float = 0.05) -> tuple[np.ndarray, np.ndarray]:
+def all_around(model: StatisticalModel, posed: Posed, std: float = 0.05) -> tuple[ndarray, ndarray]:
     """Noisy points of a state's whole outside, as stitched scans have it, and its normals there."""
     mesh = model.mesh(posed.place(model.material(posed.z)))
     vertices, faces, _ = SegmentedMesh(mesh.segments[1:]).merged()  # without the core inside

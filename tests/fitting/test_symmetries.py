@@ -7,6 +7,7 @@ import numpy as np
 import trimesh
 from answers import fit_modes
 from fit_cases import IN_FRONT, seen
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import Generator, default_rng
 from numpy.testing import assert_allclose
@@ -137,10 +138,13 @@ def test_radii_hold_what_is_left_open() -> None:
     parts = replace(without, open=turns).radii()
     radii = parts.radii()
     assert_allclose(parts.gaussian, alone.gaussian)
+    assert not alone.open.any()
     wheel = model.labels == 2
     assert_allclose(radii[~wheel], alone.radii()[~wheel])
     rim = wheel & (norm(model.rest_points[:, :2], axis=1) > 5.5)
     assert radii[rim].min() > 8.0 and radii[rim].max() < 20.0
+    follow = model.weights(model.rest_points[:5], model.labels[:5])
+    assert_allclose(replace(without, open=turns).radii(follow).radii(), radii[:5], rtol=0.2)
     assert_allclose(parts.radii(1e-9)[rim], parts.open[rim])  # how far a turn goes no calibration scales
     assert_allclose(parts.radii(2.0) ** 2, 4 * parts.gaussian**2 + parts.open**2)
 
@@ -188,18 +192,18 @@ def states() -> DrawnStates:
     return DrawnStates.of(scene(), model(), 80, 1000)
 
 
-def moved(z: np.ndarray) -> np.ndarray:
+def moved(z: ndarray) -> ndarray:
     return material_moved(scene(), model(), Drawn.of(scene(), 1000).deformations(scene(), z))
 
 
-def problem_of(z: np.ndarray, points: int = 4000) -> DrawsProblem:
+def problem_of(z: ndarray, points: int = 4000) -> DrawsProblem:
     material = transform_points(IN_FRONT, moved(z))
     cloud = seen(model().mesh(material))
     fitted = fit_modes(cloud[:: max(1, len(cloud) // points)], model(), 1.0, material)
     return DrawsProblem.of(fitted.problem, states())
 
 
-def state(problem: DrawsProblem, z: np.ndarray) -> DrawsFit:
+def state(problem: DrawsProblem, z: ndarray) -> DrawsFit:
     fit = simulate(problem, Drawn.of(scene(), 1000), z, POSE)
     assert fit is not None
     motion = states().derivatives(fit.drawn, fit.z, fit.material[states().played.index])

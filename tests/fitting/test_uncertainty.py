@@ -13,6 +13,7 @@ import trimesh
 from answers import answer_to, fit_cloud
 from fit_cases import SCENE, seen, shown
 from folder_contents import read_json
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose, assert_array_equal
@@ -49,12 +50,12 @@ from mereo_learning.cases import RegistrationErrors, seen_points
 
 
 @pytest.fixture(scope="module")
-def material(model: StatisticalModel) -> np.ndarray:
+def material(model: StatisticalModel) -> ndarray:
     return shown(model, 0.5)[1]
 
 
 @pytest.fixture(scope="module")
-def found(model: StatisticalModel, material: np.ndarray) -> Registration:
+def found(model: StatisticalModel, material: ndarray) -> Registration:
     registration = fit_cloud(seen(model.mesh(material)), model, material)
     assert registration.method == "modes" and registration.explained > 0.95
     return registration
@@ -104,7 +105,7 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
         change = rng.normal(size=gradients.shape[2:])
         ends = [len(nested.segments[0].vertices)]
 
-        def at(step: float, change: np.ndarray = change, ends: list[int] = ends) -> tuple[np.ndarray, np.ndarray]:
+        def at(step: float, change: ndarray = change, ends: list[int] = ends) -> tuple[ndarray, ndarray]:
             moves = np.split(step * change, ends)
             parts = [s.vertices + move for s, move in zip(nested.segments, moves, strict=True)]
             moved = nested.with_vertices(parts)
@@ -116,7 +117,7 @@ def test_the_gradients_of_volumes_and_centroids_are_their_differences() -> None:
         assert_allclose(said[:, 1:], (center - other) / 2e-5, rtol=1e-3, atol=1e-5)
 
 
-def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: np.ndarray, sure: Uncertainty) -> None:
+def test_radii_are_in_the_unit_of_the_input(model: StatisticalModel, material: ndarray, sure: Uncertainty) -> None:
     turn = Rotation.from_euler("z", 40, degrees=True).as_matrix()
     points = seen(model.mesh(material))
     for unit in (0.001, 25.0):
@@ -175,7 +176,7 @@ def test_a_surface_that_may_be_elsewhere_is_doubted(found: Registration) -> None
 
 
 def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
-    found: Registration, sure: Uncertainty, material: np.ndarray
+    found: Registration, sure: Uncertainty, material: ndarray
 ) -> None:
     """The true one may be outside once in twenty times, but not by as much again."""
     here = found.mesh.owned_volumes
@@ -186,7 +187,7 @@ def test_the_interval_of_a_volume_is_around_it_and_not_far_from_the_true_one(
         assert 0 < high - low < 0.2 * true and abs(true - volume) < high - low
 
 
-def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Uncertainty, material: np.ndarray) -> None:
+def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Uncertainty, material: ndarray) -> None:
     shown = seen_points(material, PointCloud(seen(found.model.mesh(material))), 1.0)
     sure, found = replace(sure, scale=1.0), replace(found, radius_scale=1.0)
     one = RegistrationErrors.of(found, material, shown, 1.0)
@@ -200,11 +201,12 @@ def test_the_scale_is_that_which_holds_95_percent(found: Registration, sure: Unc
     scale = both.scale()
     said = both.scaled(scale).coverage(unit_mm=2.0)
     assert said["all"] == pytest.approx(0.95, abs=1e-3)
+    assert both.scaled(None).coverage()["all"] == pytest.approx((one.ratios <= 1).mean())
     assert said["radius_seen"] == pytest.approx(scale * np.median(one.gaussian[shown]))
     assert said["radius_hidden_mm"] == pytest.approx(2.0 * scale * np.median(one.gaussian[~shown]))
 
 
-def test_a_registration_from_a_file_has_no_radii(found: Registration, material: np.ndarray) -> None:
+def test_a_registration_from_a_file_has_no_radii(found: Registration, material: ndarray) -> None:
     read = replace(found, optimum=None)
     assert read.uncertainty is None and read.radius95([[0.0, 0.0, 0.0]], at="rest") is None
     with pytest.raises(ValueError, match="fit its frame again"):
@@ -280,7 +282,7 @@ def told(answer: Answer) -> Uncertainty:
 
 
 @pytest.fixture(scope="module")
-def radii(told: Uncertainty) -> np.ndarray:
+def radii(told: Uncertainty) -> ndarray:
     return np.concatenate(told.vertices)
 
 
@@ -289,7 +291,7 @@ def test_a_registration_says_that_it_cannot_be_sent(found: Registration) -> None
         copy.copy(found)
 
 
-def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(answer: Answer, radii: np.ndarray, folder: Path) -> None:
+def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(answer: Answer, radii: ndarray, folder: Path) -> None:
     """With --millimetres, of a frame whose unit is half a metre."""
     data = (folder / "segments.ply").read_bytes()
     head, body = data.split(b"end_header\n", 1)
@@ -301,7 +303,7 @@ def test_a_ply_has_the_radius_of_each_vertex_in_its_unit(answer: Answer, radii: 
     assert_allclose(vertices["x"], 500.0 * answer.registered.material[: len(vertices), 0], rtol=1e-4)
 
 
-def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, radii: np.ndarray, folder: Path) -> None:
+def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, radii: ndarray, folder: Path) -> None:
     scene = trimesh.load_scene(folder / "segments.glb", process=False)
     rows = np.split(np.arange(len(radii)), np.cumsum(answer.registered.model.vertex_counts)[:-1])
     for mesh, part in zip(scene.geometry.values(), rows, strict=True):
@@ -312,7 +314,7 @@ def test_a_glb_has_the_radius_of_each_vertex_and_says_its_unit(answer: Answer, r
         assert_allclose(mesh.vertex_attributes["_RADIUS95"][:, 0], radii[part][same], rtol=1e-3)
 
 
-def test_label_volumes_have_the_radius_of_each_voxel(radii: np.ndarray, folder: Path) -> None:
+def test_label_volumes_have_the_radius_of_each_voxel(radii: ndarray, folder: Path) -> None:
     with np.load(folder / "labels.npz") as values:
         labels = values["labels"]
         found = values["radius95"]
@@ -327,7 +329,7 @@ def test_label_volumes_have_the_radius_of_each_voxel(radii: np.ndarray, folder: 
     assert_allclose(told, 500.0 * found, rtol=1e-5)
 
 
-def test_the_summary_tells_centroids_volumes_and_the_whole(told: Uncertainty, radii: np.ndarray, folder: Path) -> None:
+def test_the_summary_tells_centroids_volumes_and_the_whole(told: Uncertainty, radii: ndarray, folder: Path) -> None:
     summary = read_json(folder / "summary.json")
     lengths = {"median": pytest.approx(np.median(radii)), "max": pytest.approx(radii.max())}
     assert summary["radius95"] == {**lengths, "calibrated": False, "unit_m": 0.5}

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from angle import write_angle
 from folder_contents import read_json
+from numpy import ndarray
 from numpy.linalg import norm
 from numpy.random import default_rng
 from numpy.testing import assert_allclose
@@ -37,7 +38,7 @@ SLOPE = Rotation.from_euler("x", 35, degrees=True)
 """From a desk with y down into the camera frame."""
 
 
-def on_desk(x: float, height: float, away: float) -> np.ndarray:
+def on_desk(x: float, height: float, away: float) -> ndarray:
     """Place above the desk, metres."""
     return SLOPE.apply([x, -height, away]) + np.array([0.0, 0.05, 0.6])
 
@@ -75,12 +76,12 @@ def rest(folder: Path) -> SegmentedMesh:
 
 
 @pytest.fixture(scope="module")
-def long(folder: Path) -> np.ndarray:
+def long(folder: Path) -> ndarray:
     """Places of one part of the angle in its files' frame, metres."""
     return np.asarray(trimesh.load(folder / "long.stl").vertices) / 1000
 
 
-def segment(name: str, mesh: trimesh.Trimesh, vertices: np.ndarray) -> Segment:
+def segment(name: str, mesh: trimesh.Trimesh, vertices: ndarray) -> Segment:
     return Segment(name, (0, 0, 0), vertices, np.asarray(mesh.faces))
 
 
@@ -120,7 +121,7 @@ def found(image: DepthImage, angle: mereo.Object) -> mereo.Result:
 
 
 def test_an_object_among_others_is_known_at_its_place(
-    found: mereo.Result, image: DepthImage, rest: SegmentedMesh, long: np.ndarray
+    found: mereo.Result, image: DepthImage, rest: SegmentedMesh, long: ndarray
 ) -> None:
     assert found.known is True and found.pose is not None
     assert found.seen.steps[-1].name == "whole frame" and found.seen.steps[-1].before == image.valid.sum()
@@ -153,7 +154,7 @@ SECOND = rigid(
 
 
 def test_each_instance_is_at_its_place_and_has_a_folder(
-    placed: SegmentedMesh, rest: SegmentedMesh, angle: mereo.Object, long: np.ndarray, tmp_path: Path
+    placed: SegmentedMesh, rest: SegmentedMesh, angle: mereo.Object, long: ndarray, tmp_path: Path
 ) -> None:
     both = desk(*placed.segments, *(replace(each, name=f"{each.name} 2") for each in rest.transformed(SECOND).segments))
     found = mereo.reconstruct(both, angle, unit_m=1.0, instances="all")
@@ -226,7 +227,7 @@ def test_an_outline_that_is_not_the_images_makes_an_answer_unsure_or_refuses_it(
 # --- where it is ------------------------------------------------------------------------------------------------------
 
 
-def pixel_of(place: np.ndarray) -> tuple[int, int]:
+def pixel_of(place: ndarray) -> tuple[int, int]:
     column, row = np.floor(CAMERA.project(place[None])[0]).astype(int)
     return int(column), int(row)
 
@@ -250,11 +251,11 @@ def looked_at(
     registrar: Registrar,
     config: mereo.IsolationConfig,
     outline: Outline = Outline(),  # noqa: B008 (immutable)
-) -> list[np.ndarray]:
+) -> list[ndarray]:
     """Regions that are looked at for the first place, were its outline this one."""
-    looked = list[np.ndarray]()
+    looked = list[ndarray]()
 
-    def look(frame: WholeFrame, mask: np.ndarray) -> Place:
+    def look(frame: WholeFrame, mask: ndarray) -> Place:
         looked.append(mask)
         return Place(mask, (), placed, outline)
 
@@ -435,7 +436,7 @@ def test_noise_that_neighbours_share_is_measured_on_the_plane_around_the_object(
 
 
 def test_an_object_is_followed_through_whole_frames_lost_and_seen_again(
-    image: DepthImage, rest: SegmentedMesh, long: np.ndarray, angle: mereo.Object, on_angle: tuple[int, int]
+    image: DepthImage, rest: SegmentedMesh, long: ndarray, angle: mereo.Object, on_angle: tuple[int, int]
 ) -> None:
     """Its point is where it is in the first frame."""
     with mereo.Tracker(angle, executor=SynchronousExecutor()) as tracker:
