@@ -733,13 +733,11 @@ class Trail:
 
     Attributes:
         handicap: misfit by which another hypothesis is likelier before the frame was seen.
-        turned: the best state when that was turned last.
     """
 
     problem: Problem
     handicap: float = 0.0
     fitted: list[ScoredFit] = field(default_factory=list)
-    turned: ScoredFit | None = None
 
     @property
     def best(self) -> ScoredFit:
@@ -778,11 +776,11 @@ class Trail:
         Not where few points show that it is worse: they would have to be bent to it more than they have been.
         """
         problem = self.problem
-        while self.best is not self.turned:
-            self.turned = self.best
-            posed = self.turned.posed
-            most = problem.coarse.screen(posed, BENDING[-1][2] * problem.model.half).total
-            ranked = bend_by_few(problem, turned(problem, posed), TURNED)[:TURNED]
+        before = None
+        while self.best is not before:
+            before = self.best
+            most = problem.coarse.screen(before.posed, BENDING[-1][2] * problem.model.half).total
+            ranked = bend_by_few(problem, turned(problem, before.posed), TURNED)[:TURNED]
             self.fitted += [fit_from_far(problem, each) for cost, each in ranked if cost < most]
 
     def with_heavier_cloud(self) -> "Trail | None":

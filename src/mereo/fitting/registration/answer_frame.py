@@ -93,8 +93,7 @@ def answer_of(
     """Make the answer of a candidate, and recognize the object in it."""
     stated = None if registrar is None else registrar.stated_scene_unit(seen.frame.unit_m)
     unseen = None if registration is None or seen.lines.other_lines is not None else candidate.unseen(registration)
-    is_open = registration is not None and registration.doubt
-    doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or is_open or None
+    doubt = seen.doubt or (candidate.is_featureless and FEATURELESS) or (registration and registration.doubt) or None
     recognition = recognize(registration, stated, unseen, model is not None).doubted(doubt)
     used = candidate.encoded
     if registrar is not None and registration is not None:
