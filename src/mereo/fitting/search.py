@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from itertools import cycle, permutations
+from itertools import permutations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -755,10 +755,14 @@ class Trail:
     @property
     def is_evident(self) -> bool:
         """Whether that explains a clean frame, and no other hypothesis may win as much as the frame rules out of it."""
-        problem = self.problem
         best = self.best
-        is_explained = best.misfit.cloud < FitConfig.explained and not problem.is_noisy
-        return is_explained and problem.silhouette_misfit(best.surface) + self.handicap < WHOLE
+        is_explained = best.misfit.cloud < FitConfig.explained
+        return is_explained and self.problem.silhouette_misfit(best.surface) + self.handicap < WHOLE
+
+    @property
+    def quiet(self) -> Problem:
+        """The problem with no more noise than that leaves over."""
+        return self.problem.quieted(self.problem.left_noise(self.best.surface))
 
     def fit(self, poses: list[Posed]) -> None:
         """Fit the candidates that may be the best."""
@@ -854,13 +858,10 @@ def search(
         chosen = likelier(with_left_noise(trails))
         if not everywhere or (chosen.is_explained and not chosen.problem.shares_noise):
             return chosen.with_heavier_cloud() or chosen.with_shared_noise()
-    # poses of a mechanism take seconds, so that which rules out least says those of both
-    screened = trails[-1:] if isinstance(whole.model, Mechanism) else trails
-    poses = (screen_poses(trail.problem, SCREENING) for trail in screened)
-    for trail, each in zip(trails, cycle(poses)):  # screened once it is its turn
-        trail.fit(each)
-        if trail.is_evident:
-            return trail
+    for trail in trails:
+        trail.fit(screen_poses(trail.problem, SCREENING))
+        if not trail.quiet.is_noisy and (evident := with_left_noise([trail])[0]).is_evident:
+            return evident
     for trail, other in permutations(trails, 2):  # either may have found what the other has missed
         trail.fitted.append(refined(trail.problem, other.best.posed))
     chosen = likelier(with_left_noise(trails))
