@@ -756,13 +756,16 @@ class Trail:
     def is_evident(self) -> bool:
         """Whether that explains a clean frame, and no other hypothesis may win as much as the frame rules out of it."""
         best = self.best
-        is_explained = best.misfit.cloud < FitConfig.explained
-        return is_explained and self.problem.silhouette_misfit(best.surface) + self.handicap < WHOLE
+        return (
+            best.misfit.cloud < FitConfig.explained
+            and self.problem.silhouette_misfit(best.surface) + self.handicap < WHOLE
+        )
 
     @property
-    def quiet(self) -> Problem:
-        """The problem with no more noise than that leaves over."""
-        return self.problem.quieted(self.problem.left_noise(self.best.surface))
+    def is_noisy(self) -> bool:
+        """Whether that leaves a camera's noise over, where neighbours differ as by one."""
+        problem = self.problem
+        return problem.is_noisy and problem.with_noise(problem.left_noise(self.best.surface)).is_noisy
 
     def fit(self, poses: list[Posed]) -> None:
         """Fit the candidates that may be the best."""
@@ -860,7 +863,7 @@ def search(
             return chosen.with_heavier_cloud() or chosen.with_shared_noise()
     for trail in trails:
         trail.fit(screen_poses(trail.problem, SCREENING))
-        if not trail.quiet.is_noisy and (evident := with_left_noise([trail])[0]).is_evident:
+        if not trail.is_noisy and (evident := with_left_noise([trail])[0]).is_evident:
             return evident
     for trail, other in permutations(trails, 2):  # either may have found what the other has missed
         trail.fitted.append(refined(trail.problem, other.best.posed))
