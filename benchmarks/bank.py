@@ -232,10 +232,7 @@ def terms_of(candidate: Candidate) -> dict[str, Any]:
         "information": eigenvalues.astype(np.float32),
         "pairs": problem.pairs.energy(posed.z) if is_modes else 0.0,
         "narrowing": modes.narrowing(problem, posed) if is_modes and len(posed.z) else 0.0,
-        "explains": bool(
-            candidate.misfit is not None
-            and problem.explained(candidate.misfit.cloud, surface, problem.config.explained)
-        ),
+        "explains": candidate.misfit is not None and problem.explained(surface),
         "left_noise": problem.left_noise(surface),
         "material": surface.material,
     }

@@ -18,11 +18,9 @@ from mereo.fitting.problem.evidence import Evidence
 from mereo.fitting.problem.problem import (
     ACCEPTED,
     CLEAN,
-    SHARED,
     SIGMAS,
     is_normal,
     noise_of,
-    shared,
     shared_variance,
 )
 from mereo.fitting.problem.residuals import Surface
@@ -208,8 +206,6 @@ def test_what_neighbours_share_is_no_noise_of_points(points: ndarray) -> None:
     assert noise_of(own, around) == pytest.approx(0.3, rel=0.1)
     assert noise_of(own + 1.0, around) == pytest.approx(0.3, rel=0.1)
     assert noise_of(half, around) == 0.0
-    assert 0.97 < shared(own, around, 0.45) < SHARED
-    assert shared(own + 0.5, around, 0.45) > 1.3 and shared(own + half, around, 0.45) > 1.3
 
 
 def test_noise_that_neighbours_share_is_spread_evenly_and_a_wrong_state_is_not() -> None:
@@ -272,14 +268,16 @@ def test_what_neighbours_share_is_told_from_what_points_have_alone(registrar: Re
     assert 0.1 < norm(forward) < 0.6
 
 
-def test_a_noisy_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: ndarray) -> None:
-    found = fitted(registrar, noisy(points, 0.4)).modes
-    assert found is not None and found.problem.is_noisy
-    problem = found.problem
-    aside = found.surface.material + np.array([0.0, 0.0, 1.0])
-    assert problem.explained(9.0, found.surface, 0.1)
-    assert not problem.explained(9.0, Surface.through(problem.model, aside), 0.1)
-    assert not problem.with_noise(0.0).explained(9.0, found.surface, 0.1)
+def test_a_cloud_is_explained_where_only_noise_is_left(registrar: Registrar, points: ndarray) -> None:
+    """Noise of a camera leaves a few points far off; of a clean frame no point is."""
+    for noise in (0.0, 0.4):
+        found = fitted(registrar, noisy(points, noise)).modes
+        problem, evidence = found.problem, found.problem.evidence
+        x = evidence.points[:, :1]  # half of them, and a few, are below
+        for off, is_explained in ((1.0, False), (x < 0.0, False), (x % 1.0 < 0.03, noise > 0.0), (0.0, True)):
+            seen = replace(evidence, points=evidence.points + off)
+            assert problem.changed(evidence=seen).explained(found.surface) == is_explained
+    assert not problem.with_noise(0.0).explained(found.surface)
 
 
 def test_constants_follow_the_noise_and_end(registrar: Registrar, points: ndarray) -> None:

@@ -194,7 +194,7 @@ def test_a_noisy_frame_is_explained_where_neighbours_share_as_much_as_they_do_ar
     for share, is_explained in ((np.inf, False), (0.1, False), (0.5, True)):
         evidence = replace(Evidence.of(seen), shared_noise=SharedNoise(share))
         problem = Problem(model, evidence, OPEN_SCALE_STD, FitConfig(), noise=0.5)
-        assert ScoredFit.of(problem, posed).explains(problem) is is_explained
+        assert problem.explained(problem.surface(posed)) is is_explained
 
 
 def test_others_explain_a_frame_alike_where_their_misfit_is_hardly_greater(

@@ -24,8 +24,6 @@ class FitConfig:
         start_sigma: the cloud's standard deviation at first, as a share of half the rest box's longest side.
         cloud_sigma: last standard deviation of the cloud, where its noise is not larger.
         cloud_weight: how many independent points the cloud is worth.
-        explained: the cloud's misfit, in squared standard deviations of a sample, above which other states are tried.
-        unexplained: the same, above which a fit is likely wrong.
         samples: points of the surface that stand for it in most steps.
         silhouette_vertices: how many of them are compared with what the frame rules out.
         silhouette_weight: how many independent points one of them is worth, of ``SILHOUETTE_VERTICES``.
@@ -40,8 +38,6 @@ class FitConfig:
     start_sigma: float = 0.06
     cloud_sigma: float = 0.2
     cloud_weight: float = 3000.0
-    explained: float = 0.147
-    unexplained: float = 0.3
     samples: int = 3000
     silhouette_vertices: int = 500
     silhouette_weight: float = 0.2
@@ -71,9 +67,7 @@ class DrawsConfig:
     steps: int = 6
 
 
-ELASTIC = FitConfig(
-    cloud_sigma=0.12, cloud_weight=250.0, explained=0.41, unexplained=0.83, samples=10_000, by_normals=True
-)
+ELASTIC = FitConfig(cloud_sigma=0.12, cloud_weight=250.0, samples=10_000, by_normals=True)
 """Constants for objects whose model is that of an elastic solid, which real states are near but never in.
 
 What they are off by is shared by many points, so the cloud is worth fewer; experiments, entry 68."""

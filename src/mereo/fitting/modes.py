@@ -112,10 +112,6 @@ class ScoredFit:
         problem = problem.cleared(surface)
         return cls(posed, problem.misfit(posed, surface), surface, problem)
 
-    def explains(self, problem: Problem) -> bool:
-        """Whether the state explains the cloud, noise aside."""
-        return problem.explained(self.misfit.cloud, self.surface, problem.config.explained)
-
 
 total_misfit = attrgetter("misfit.total")
 

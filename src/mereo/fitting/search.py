@@ -44,7 +44,7 @@ from mereo.fitting.modes import (
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
-from mereo.fitting.problem.problem import Problem, is_normal, noise_of
+from mereo.fitting.problem.problem import CLEAN, Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, SampledSurface
 from mereo.fitting.problem.segments import diverse_rows, rms_distance
 from mereo.geometry.solids import Solids
@@ -748,18 +748,15 @@ class Trail:
     def is_explained(self) -> bool:
         """Whether that explains the frame, noise that neighbours share aside."""
         problem, best = self.problem, self.best
-        return best.explains(problem) or (
-            problem.shares_noise and (settled := settled_once(problem, best.posed)).explains(settled.problem)
+        return problem.explained(best.surface) or (
+            problem.shares_noise and (settled := settled_once(problem, best.posed)).problem.explained(settled.surface)
         )
 
     @property
     def is_evident(self) -> bool:
         """Whether that explains a clean frame, and no other hypothesis may win as much as the frame rules out of it."""
-        best = self.best
-        return (
-            best.misfit.cloud < FitConfig.explained
-            and self.problem.silhouette_misfit(best.surface) + self.handicap < WHOLE
-        )
+        problem, surface = self.problem, self.best.surface
+        return problem.explained(surface) and problem.silhouette_misfit(surface) + self.handicap < WHOLE
 
     @property
     def is_noisy(self) -> bool:
@@ -772,7 +769,7 @@ class Trail:
         ranked = bend_by_few(self.problem, poses, FITTED)
         fitted = list[ScoredFit]()
         for cost, posed in ranked[:FITTED]:
-            if fitted and cost > RIVAL * ranked[0][0] and min(fitted, key=total_misfit).explains(self.problem):
+            if cost > RIVAL * ranked[0][0] and self.problem.explained(min(fitted, key=total_misfit).surface):
                 break
             fitted.append(fit_from_far(self.problem, posed))
         self.fitted += fitted
@@ -812,8 +809,7 @@ class Trail:
     def with_shared_noise(self) -> "Trail":
         """The same with all noise that the best fit leaves over, where nothing else explains the frame."""
         problem = self.problem.with_noise(noise_of(self.problem.offsets(self.best.surface)))
-        is_close = self.is_explained or self.best.misfit.cloud < problem.config.unexplained
-        if is_close or problem.noise <= self.problem.noise:
+        if self.is_explained or problem.noise <= max(self.problem.noise, CLEAN):
             return self
         trail = self.in_problem(problem.by_every_point)
         if not trail.leaves_noise:
