@@ -44,7 +44,7 @@ from mereo.fitting.modes import (
 )
 from mereo.fitting.problem.evidence import Evidence, Observed, SurfaceEvidence
 from mereo.fitting.problem.gauss_newton import DAMPING, Posed, cross
-from mereo.fitting.problem.problem import CLEAN, Problem, is_normal, noise_of
+from mereo.fitting.problem.problem import Problem, is_normal, noise_of
 from mereo.fitting.problem.residuals import ROBUST, Prior, SampledMechanism, SampledSurface
 from mereo.fitting.problem.segments import diverse_rows, rms_distance
 from mereo.geometry.solids import Solids
@@ -809,7 +809,7 @@ class Trail:
     def with_shared_noise(self) -> "Trail":
         """The same with all noise that the best fit leaves over, where nothing else explains the frame."""
         problem = self.problem.with_noise(noise_of(self.problem.offsets(self.best.surface)))
-        if self.is_explained or problem.noise <= max(self.problem.noise, CLEAN):
+        if not problem.is_noisy or problem.noise <= self.problem.noise or self.is_explained:
             return self
         trail = self.in_problem(problem.by_every_point)
         if not trail.leaves_noise:

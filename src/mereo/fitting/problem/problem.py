@@ -229,15 +229,19 @@ class Problem:
     def explained(self, surface: Surface) -> bool:
         """Whether a surface explains the cloud: whether it leaves no more over than noise does.
 
-        As many points as are to be accepted must lie on the surface; a clean frame has no others.
+        As many points as are to be accepted must lie on the surface; few samples say whether they do.
         """
+        return bool(
+            (self.nearest(surface)[0] <= self.tolerance).mean() >= self.config.accepted
+            and self.excess(surface).mean() < EXCESS
+        )
+
+    def excess(self, surface: Surface) -> Values:
+        """Misfit of each point beyond that of noise, which in a clean frame ends at the tolerance."""
         offset = self.offsets(surface, self.far)
-        evidence = self.evidence
         most = np.inf if self.shares_noise else self.tolerance
-        noise = np.hypot(np.clip(unshared(offset, evidence.around), -most, most), evidence.expected_noise)
-        excess = robust_square(offset, self.cloud_sigma) - robust_square(noise, self.cloud_sigma)
-        is_near = self.nearest(surface)[0] <= self.tolerance
-        return bool(is_near.mean() >= self.config.accepted and excess.mean() < EXCESS)
+        noise = np.hypot(np.clip(unshared(offset, self.evidence.around), -most, most), self.evidence.expected_noise)
+        return robust_square(offset, self.cloud_sigma) - robust_square(noise, self.cloud_sigma)
 
     @property
     def far(self) -> float:
